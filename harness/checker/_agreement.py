@@ -1,10 +1,11 @@
 """Decide whether agents with different chains had a chance to agree. The checks of characteristics 5 and 6 use this
 decision.
 
-Two idle agents with different chains stay different, because a reconcile starts only after a vote, or after a query
-that another agent sends in phase 2 of its own reconcile. A difference is therefore a violation only if the network was
-fully connected, and if the agent with the different chain then completed a reconcile that began after the last change
-of any other chain. Otherwise the characteristics do not apply.
+An agent adapts its chain to the chains of its neighbours in a process called reconcile. A reconcile starts when a vote
+fails, or when a query of another agent shows that the chains differ. Two idle agents send nothing, so their chains stay
+different, and this alone is no violation. A difference is a violation only if the network was fully connected, and if
+the agent with the different chain then completed a reconcile that began after the last change of any other chain. In
+all other cases the checks return `not applicable`.
 
 The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
 receives blocks. If all agents were switched off, the system consists of all of them. A reconcile then gives a chance to
@@ -103,15 +104,18 @@ def _explain_agent(evidence: Evidence, since: float, agent_id: int) -> str:
 
 
 def describe_absent_agents(evidence: Evidence) -> str:
-    """Return a phrase that names the switched-off agents, whose chains are ignored. The phrase completes a sentence."""
+    """Return a phrase that names the switched-off agents, such as "; without agent 3, which was switched off". The
+    checks ignore the chains of these agents. The phrase is empty if no agent was switched off.
+    """
     away = set(evidence.exports) - set(evidence.present)
     return f"; without {agents(away)}, which {'was' if len(away) == 1 else 'were'} switched off" if away else ""
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return those of the `differing` agents that had a chance to agree. An agent had a chance if it completed a
-    reconcile that began after the network became fully connected and after the last change of any other chain. During
-    this reconcile, all judged agents ran, and no other agent was present.
+    """Return those of the `differing` agents that had a chance to agree.
+
+    Such an agent completed a reconcile that began after the network became fully connected and after the last change of
+    any other chain. During the reconcile, all judged agents ran without a pause, and no other agent was present.
     """
     since = evidence.connected_since_s
     if since is None:

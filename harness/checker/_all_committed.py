@@ -66,10 +66,10 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
-    """Return the number of completed blocks that were lost, and the hashes of the other completed blocks.
+    """Return the number of lost blocks, and the hashes of all other completed blocks.
 
-    A block counts as lost if no present agent holds it, and if the agent that completed it was killed (Section 3.3),
-    restarted or switched off.
+    A block counts as lost if no present agent holds it, and if the agent that completed it was killed (Section 3.3 of
+    the thesis), restarted or switched off.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

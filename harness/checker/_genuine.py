@@ -16,7 +16,9 @@ NAME = "genuine"
 _Content = tuple[int, int, str, str]
 """The content of an exported block: agent, timestamp, event data and block hash."""
 _Link = tuple[str, str, str | None]
-"""A link of a chain: the chain hash below a block, the block hash, and the chain hash of the block."""
+"""Chain hash of the block below, block hash, and chain hash of the block itself. The last hash must follow from the
+first two.
+"""
 
 
 @dataclass
@@ -49,12 +51,13 @@ def check(evidence: Evidence) -> Judgement:
     """Recompute the hashes in all exports, and compare the exported blocks with the blocks that each agent completed.
     Return the verdict on characteristic 4.
 
-    In a secured mission the signatures decide, so the check does not need the records of the agent that a block names.
-    A signed block that this agent did not complete is still not genuine, because an attacker may have the agent's key.
-    The signed head of an export covers the order and the number of its blocks.
+    In a secured mission, agents sign their blocks and exports. The signatures then decide, so the check does not need
+    the records of the agent that a block names. A signed block that this agent did not complete is still not genuine,
+    because an attacker may have the agent's key. Each export has a signed head, which covers the order and the number
+    of its blocks.
 
-    The verdict is `not applicable` without an export, if the completed blocks of an agent are unknown, or if no anchor
-    confirms the public keys of a secured mission.
+    The verdict is `not applicable` without an export, or if the completed blocks of an agent are unknown. In a secured
+    mission it is also `not applicable` without an anchor, a trusted copy of the public keys.
     """
     findings: list[Finding] = []
     roster = evidence.roster
@@ -128,8 +131,9 @@ def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return a phrase that states when an agent received a block, and which handler processed it. The phrase ends a
-    sentence.
+    """Return the time at which an agent received a block, and the handler that processed it, as the end of a sentence:
+    "; the block arrived at t=7 s, in receive_commit_block". Return an empty text if the trace does not show the
+    arrival.
     """
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():

@@ -10,7 +10,7 @@ def check(evidence: Evidence) -> Judgement:
     """Check the exported state of each agent, and its state after each handler run. Return the verdict on
     characteristic 2.
 
-    The verdict is `not applicable` if an agent was not idle at the end, or left no export.
+    The verdict is `not applicable` if an agent left no export, or was not idle when it wrote its export.
     """
     findings = [*_check_exports(evidence), *_check_traces(evidence)]
     if findings:

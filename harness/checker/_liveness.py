@@ -80,9 +80,9 @@ def _sum_over_agents(evidence: Evidence, counter: str) -> int | None:
 
 
 def compute_uniform_at_s(evidence: Evidence) -> float | None:
-    """Return the mission second since which all chains are equal. This is the time of the last change of any chain.
+    """Return the mission second since which all chains are equal: the time of the last change of any chain.
 
-    Return None if the chains differ at the end, or if no record contains these changes.
+    Return None if the chains differ at the end, or if the time of a change is not recorded.
     """
     if len({export.chain_of_block_hashes for export in evidence.exports.values()}) != 1:
         return None

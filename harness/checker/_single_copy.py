@@ -9,8 +9,8 @@ NAME = "single copy"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Check the exports, and the states in traces. Return the verdict on characteristic 3. The verdict is `not
-    applicable` if an export is missing.
+    """Check the exports, and the state after each line of the traces. Return the verdict on characteristic 3. The
+    verdict is `not applicable` if an export is missing.
     """
     findings: list[Finding] = []
     for agent_id, export in evidence.exports.items():

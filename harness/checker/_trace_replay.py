@@ -39,13 +39,13 @@ class TraceObservation:
 
 @dataclass(slots=True)
 class ReplayedIncarnation:
-    """The replay of an agent between two restarts: the blocks that the agent held at the end, and all observations. The
-    lists of blocks contain block hashes.
+    """An agent between two restarts, replayed from its trace: the hashes of the blocks that the agent held at the end,
+    and all observations of errors.
     """
 
     trace: Trace
     number: int
-    """Number of the incarnation. The first one has number 0."""
+    """Number of earlier starts of the agent in this trace. It is 0 up to the first restart."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
     """The chain. The oldest block is first."""
@@ -56,20 +56,28 @@ class ReplayedIncarnation:
     completed: list[str] = field(default_factory=list)
     sent: int = 0
     unknown: bool = False
-    """True if the trace contains unknown operations. After the first of them, the held blocks are unknown."""
+    """True if the trace contains unknown changes of blocks. After the first of them, the replay does not know which
+    blocks the agent holds.
+    """
     impossible: list[TraceObservation] = field(default_factory=list)
     """Changes in the trace that are impossible, such as the removal of a block that the agent does not hold."""
     second_copies: list[TraceObservation] = field(default_factory=list)
     idle_too_early: list[TraceObservation] = field(default_factory=list)
-    """States in which the agent reported to be idle, although it had own blocks outside of its chain, or blocks in the
-    deque or on the stack.
+    """Trace lines on which the agent reported to be idle, although blocks were in its deque or on its stack, or blocks
+    that it had completed were not in its chain.
     """
     wrong_lengths: list[TraceObservation] = field(default_factory=list)
-    """The first recorded state whose numbers of blocks contradict the changes."""
+    """The first trace line on which the recorded number of blocks in chain, deque or stack differs from the number that
+    follows from all changes so far. Empty if there is none.
+    """
     wrong_tops: list[TraceObservation] = field(default_factory=list)
-    """The first recorded top chain hash that differs from the computed one (eq. 3.2)."""
+    """The first trace line on which the recorded top chain hash differs from the computed one (eq. 3.2). Empty if there
+    is none.
+    """
     flags: list[TraceObservation] = field(default_factory=list)
-    """Recorded states with flags that are impossible."""
+    """Trace lines with impossible flags: the agent is idle and reconciles at the same time, or a reconcile begins or
+    ends in a handler that cannot begin or end it.
+    """
     back_in_time: list[TraceObservation] = field(default_factory=list)
     out_of_sequence: list[TraceObservation] = field(default_factory=list)
 
@@ -79,9 +87,7 @@ class ReplayedIncarnation:
 
 
 def replay(trace: Trace, inception: str | None) -> list[ReplayedIncarnation]:
-    """Replay a trace. Return the result for each incarnation of the agent, which is a part of the trace between two
-    restarts.
-    """
+    """Replay a trace. Return one result for each part of the trace between two restarts of the agent."""
     bounds = [0, *trace.starts, len(trace.runs)]
     return [
         _replay_incarnation(ReplayedIncarnation(trace, number, trace.runs[start:end]), inception)
@@ -178,8 +184,8 @@ class _HeldBlocks:
                 self._chain_hashes.append(next_chain_hash(self._chain_hashes[-1], _digest(block)))
 
     def _take(self, name: str, place: list[str], block: str) -> str | None:
-        """Remove the block from the chain, deque or stack. Return None on success, or the reason why the removal is
-        impossible.
+        """Remove the block from the chain, deque or stack. Return the reason if the removal is impossible, and None if
+        it succeeds.
         """
         end = 0 if name == "deque" else -1
         in_turn = bool(place) and place[end] == block
@@ -200,8 +206,8 @@ class _HeldBlocks:
         return f"{block[:12]} leaves the {name}, but is not {'in front' if name == 'deque' else 'on top'}"
 
     def compare(self, line: int, run: HandlerRun) -> bool:
-        """Compare the state in the trace line with the result of all changes up to this line. Return true if they are
-        equal.
+        """Compare the state in the trace line with the state that follows from all changes up to this line. Return true
+        if they are equal.
         """
         incarnation, state = self._incarnation, run.state
         if (state.chain, state.deque, state.stack) != (

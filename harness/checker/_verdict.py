@@ -42,7 +42,7 @@ FURTHER_CHECKS: dict[str, Callable[[Evidence], Judgement]] = {
     "records": records.check,
     "liveness": _liveness.check,
 }
-"""The checks that are not characteristics of the thesis: the key of each check, and its function.
+"""The checks of properties that the thesis does not list as characteristics: the key of each check, and its function.
 `harness.scenario.verdict_names` defines the keys.
 """
 
@@ -56,13 +56,13 @@ class Result:
     figures: dict[str, float | int | None]
     """The numeric results by name, as in run.json. A value of None is unknown."""
     beside: dict[str, Judgement] = field(default_factory=dict)
-    """The judgements of the further checks `steps`, `records` and `liveness`."""
+    """The judgements of the three further checks. Their keys are `steps`, `records` and `liveness`."""
     errors: list[str] = field(default_factory=list)
     """One sentence for each file that could not be read completely."""
     chains: dict[int, tuple[str, ...]] = field(default_factory=dict)
     """Agent ID -> block hashes of its chain in hexadecimal, oldest first."""
     top_chain_hashes: dict[int, str] = field(default_factory=dict)
-    """Agent ID -> hash of its whole chain in hexadecimal."""
+    """Agent ID -> top chain hash in hexadecimal. This hash identifies the agent's whole chain."""
 
     @property
     def judgements(self) -> dict[str, Judgement]:
@@ -78,9 +78,7 @@ class Result:
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """The keys of the checks with a bad verdict. `liveness` is not included if the swarm may only need more
-        time.
-        """
+        """The keys of the checks with a bad verdict, without `liveness` if the swarm may only need more time."""
         return tuple(key for key in self.bad if self.judgements[key].verdict != UNFINISHED)
 
     @property
@@ -127,8 +125,8 @@ def check(run: Evidence | RunArchive) -> Result:
 
 
 def stored_differences(record: RunRecord, result: Result, survived: Survival) -> Iterator[str]:
-    """Yield a sentence for each stored verdict or numeric result that differs from the new one. A run without a stored
-    verdict has no difference.
+    """Yield a sentence for each verdict or numeric result in run.json that differs from the new one. Yield nothing if
+    run.json contains no verdict.
     """
     if not record.characteristics:
         return

@@ -1,7 +1,8 @@
 """Check one part of characteristic 1: an agent continues when its own timer expires, and does not wait longer for other
 agents.
 
-A vote and each step of a reconcile end with a timer. An agent that waits longer than its timers would wait forever.
+Each vote and each step of a reconcile has a timer. If no next step follows within the duration of the timer, the agent
+waits for something else, for example for an answer that may never arrive.
 """
 
 import math
@@ -31,7 +32,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches that do not continue the reconcile, although their handlers belong to a reconcile."""
+"""Branches (results of a handler) that do not continue the reconcile, although their handlers belong to a reconcile."""
 
 
 def _continues_reconcile(run: HandlerRun) -> bool:
@@ -47,18 +48,20 @@ ALL_TIMERS = (*VOTE_TIMERS, *RECONCILE_TIMERS)
 
 @dataclass(slots=True)
 class _UnfinishedOperation:
-    """A vote or reconcile in progress."""
+    """The current vote or reconcile of an agent. Each step of the trace updates it."""
 
     what: str
     longest: float
     """Maximum number of mission seconds between two steps of this vote or reconcile."""
     line: int = 0
     since: float = math.inf
-    """Mission second of the last step. Infinity if no vote or reconcile is in progress."""
+    """Mission second of the last step. Infinity before the first vote or reconcile."""
     due_s: float = math.inf
     """Mission second until which the next step must follow. Infinity if no vote or reconcile is in progress."""
     was_late: bool = False
-    """True if the agent may have been suspended during this step."""
+    """True if the next step was overdue, but the agent's computer may have been suspended. The agent then got more
+    time.
+    """
 
     def begin(self, line: int, now: float) -> None:
         self.line, self.since, self.due_s, self.was_late = line, now, now + self.longest, False
@@ -72,9 +75,8 @@ class _UnfinishedOperation:
 
 
 def waited_too_long(evidence: Evidence) -> Iterator[Finding]:
-    """Yield each vote or reconcile that lasted longer than the agent's timers and the measured lag allow.
-
-    Paused agents are excluded.
+    """Yield a finding for each vote or reconcile that did not continue within the duration of its timer, although the
+    agent was neither paused nor delayed by a slow machine.
     """
     for agent_id, trace in evidence.traces.items():
         if evidence.describe_unknown_name("handler", "branch", agent_id=agent_id):
@@ -113,8 +115,9 @@ def _find_in_incarnation(
 def _find_overdue(evidence: Evidence, agent_id: int, now: float, *waits: _UnfinishedOperation) -> Iterator[Finding]:
     """Yield a finding for each overdue vote or reconcile.
 
-    No record of a real flight shows whether the computer was suspended, or whether its clock was set. There, an agent
-    may therefore handle an overdue timer directly after its first line that is late.
+    Records of a real flight do not show whether the computer was suspended, or whether its clock was set. In such
+    records, the first late trace line is therefore no finding. The agent may still handle the overdue timer directly
+    after this line.
     """
     for wait in waits:
         if now <= wait.due_s:

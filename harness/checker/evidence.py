@@ -47,8 +47,9 @@ if TYPE_CHECKING:
 Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, SentMessage], ...]
-"""The messages of one agent that have the same type and sequence number. Each message has the mission second at which
-the agent sent it. Each incarnation of the agent sends at most one of these messages.
+"""The messages of one agent that have the same type and sequence number, each with the mission second at which the
+agent sent it. There is more than one only if the agent restarted, because a restarted agent numbers its messages from 0
+again.
 """
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: message type -> sequence number -> messages."""
@@ -59,16 +60,16 @@ incarnation (the time between two restarts), the function receives None in place
 """
 
 MAX_LINK_CHANGES = 20_000_000
-"""Maximum for the number of links multiplied by the number of network changes. Up to this maximum, the checker computes
-the loss rates of links, which takes at most about ten seconds.
+"""Maximum product of the number of links and the number of network changes. Above this maximum, the checker does not
+compute the loss rates of links, because the computation would take more than about ten seconds.
 """
 
 _HASH = re.compile(f"[0-9a-f]{{{2 * HASH_BYTES}}}")
 
 
 class InjectedDatagram(BaseModel):
-    """A line of `rogue.jsonl`, the log of injected datagrams. The line describes one datagram, or only counts several
-    datagrams.
+    """A line of `rogue.jsonl`, the log of datagrams that a simulated attacker injected. The line describes one
+    datagram, or contains only the number of several datagrams.
     """
 
     model_config = ConfigDict(extra="ignore", defer_build=True)
@@ -93,21 +94,21 @@ class NetworkLogEntry(BaseModel):
     disk: str | None = None
     planned_s: float | None = None
     asked: dict[str, Any] | None = None
-    """The conditions that the scenario requested, in the format of `NetworkConditions.to_json`."""
+    """The network conditions that the scenario requested, in the format of `NetworkConditions.to_json`."""
     counters: Counters | None = None
     """The packet counters of the kernel. Only the last line of the file contains counters."""
 
 
 @dataclass
 class RogueTraffic:
-    """The messages that the rogue node (a sender outside the swarm) injected, as far as the injection log lists
-    them.
+    """The messages that the rogue node injected according to the injection log. The rogue node is a sender outside the
+    swarm.
     """
 
     messages: set[tuple[Any, Any, Any]] = field(default_factory=set)
     """The injected messages, each as (sender, sequence number, type)."""
     counted: bool = False
-    """True if the log contains only the number of some messages."""
+    """True if some lines of the log contain only a number of messages. Any message can then be an injected one."""
     outside_senders: set[int] = field(default_factory=set)
     """Agents in whose name the scenario delivers datagrams from outside of the swarm. The records of these senders are
     missing.
@@ -155,27 +156,27 @@ class Evidence:
     watch: Watch | None = None
     """A function that receives each step that the step judge examines."""
     scenario: Scenario | None = None
-    """The recorded scenario. None if the run has no record, or if it took place in memory, because such a scenario
-    cannot have been edited.
+    """The recorded scenario. It is None if the run has no record. It is also None if the scenario was only in memory,
+    because such a scenario cannot have been edited after the run.
     """
     link_losses: list[tuple[float, dict[Link, float]]] = field(default_factory=list)
     """The changes of the loss rates (0 to 1) of links. Each entry contains the mission second of a change and the new
     loss rates of the changed links. The first entry contains all links.
     """
     delivers_all: bool = False
-    """True if virtual time delivered every message. Otherwise virtual time did not deliver messages that the released
-    core ignores.
+    """True if the simulation delivered every message that was not lost. It is false if the simulation skipped messages
+    that the released agent core ignores, which saves time.
     """
     from_field: bool = False
-    """True for files without the run record run.json. Without this record, no counter shows how many lines the traces
-    should have, so lines may be missing.
+    """True for files without the run record run.json, for example from a real flight. Without the counters in run.json,
+    the checker cannot know how many lines a trace should have, so lines may be missing.
     """
     steps: Judgement | None = None
     """The judgement on the steps, if the checker has already made it. None otherwise."""
     stores: dict[int, Path] = field(default_factory=dict)
-    """The path of the store that the last incarnation of an agent wrote. Agents without a store are missing."""
+    """Agent ID -> path of the state that the agent last stored on disk. Agents without stored state are missing."""
     channel: list[ChannelLine] | None = None
-    """The journal of the shared channel. None if the run has no journal."""
+    """The log of the radio channel that all vehicles share. None if the run has no such log."""
     report_progress: ReportProgress = lambda step: None
     """A function that receives the name of each long step of the checker."""
     _derived: dict[Callable[["Evidence"], Any], Any] = field(
@@ -194,8 +195,8 @@ class Evidence:
 
     @cached_property
     def sent_without_trace(self) -> bool:
-        """True if agents with keys may have sent revocations, challenges or echoes. Traces have no lines for these
-        datagrams.
+        """True if agents of a secured mission may have sent datagrams that no trace contains: revocations of keys, or
+        challenges and echoes, with which a restarted agent checks that its peers are active.
 
         Agents send challenges and echoes only after a restart, or after a datagram that needs one.
         """
@@ -217,8 +218,8 @@ class Evidence:
 
     @cached_property
     def unknown(self) -> dict[int, UnknownNames]:
-        """Agent ID -> the names in the agent's trace that the agent contract does not define. Agents without such names
-        are missing.
+        """Agent ID -> the names in the agent's trace that the agent contract does not define, such as names of
+        handlers. Agents whose names are all defined are missing.
         """
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
@@ -257,7 +258,9 @@ class Evidence:
         return sendings
 
     def cached(self, derive: Callable[["Evidence"], Derived]) -> Derived:
-        """Return `derive(self)`. The function runs only once. Later calls return the stored value."""
+        """Return `derive(self)`. The first call stores the value, and later calls with the same function return the
+        stored value.
+        """
         if derive not in self._derived:
             self._derived[derive] = derive(self)
         derived: Derived = self._derived[derive]
@@ -343,7 +346,9 @@ class Evidence:
 
     @property
     def presence_s(self) -> tuple[float, float]:
-        """The interval (start, end) in mission seconds during which exactly the agents in `present` ran."""
+        """The interval (start, end) in mission seconds during which all agents in `present` ran and no other agent
+        ran.
+        """
         off_s = self.switched_off.values()
         if set(self.exports) <= set(self.switched_off):
             return 0.0, min(off_s, default=math.inf)
@@ -426,8 +431,8 @@ class Evidence:
 
     @property
     def has_fates(self) -> bool:
-        """True if the section `fates` of the scenario decided which messages arrived. Otherwise only the network
-        decided.
+        """True if the section `fates` of the scenario decided for each message whether it arrived. Otherwise the
+        network decided.
         """
         return self.record is not None and any(state.what == NO_MORE_FATES for state in self.record.network)
 
@@ -493,8 +498,8 @@ def gather(archive: RunArchive) -> Evidence:
 
 
 def _marked(trace: Trace, record: JudgedRecord | None) -> Trace:
-    """Return the trace of a remote agent with a problem if the trace lacks the end of an incarnation. Return any other
-    trace as it is.
+    """Return the trace of an agent on another computer, with a problem added if the end of an incarnation is missing
+    from the trace. Return all other traces unchanged.
     """
     remote = record.remote.get(str(trace.header.agent_id)) if record else None
     if remote is None or not remote.incomplete or trace.problem:

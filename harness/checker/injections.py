@@ -1,12 +1,13 @@
 """Count how the agents handled injected messages. The sources are the injection log and the traces.
 
-A forged message has a sequence number that no agent uses. Each handler run with this number therefore belongs to the
-rogue node. A replayed copy of a message is equal to its original. If an agent handled this message several times, the
-check therefore assigns the last handler runs to the copies. It assigns at most one run to each copy sent before.
+The rogue node, a simulated attacker, either forges messages or sends copies of real messages again. A forged message
+has a sequence number that no agent uses. Each handler run with this number therefore belongs to the rogue node. A copy
+is equal to its original, so a trace cannot distinguish them. If an agent handled such a message several times, the
+check assigns the last handler runs to the copies. It assigns at most one run to each copy that was sent before the run.
 
-A secured agent handles each datagram only once, and handles no altered datagram. Corrupted messages therefore count as
-not handled. A copy that is sent immediately cannot be distinguished from the original. A delayed copy counts as handled
-by each agent that handles it for the first time, because the original did not reach this agent.
+An agent of a secured mission handles each datagram only once, and drops altered datagrams. Corrupted messages therefore
+count as not handled. A copy that is sent immediately cannot be distinguished from the original. If an agent handles a
+delayed copy, the original did not reach this agent, so the handler run belongs to the copy.
 """
 
 from collections import Counter, defaultdict
@@ -52,7 +53,7 @@ class _RogueLine(BaseModel):
 
 
 _Key = tuple[Any, Any, Any]
-"""The identity of a message in a trace: sender, sequence number and type."""
+"""Sender, sequence number and type of a message. Traces identify a message by these three values."""
 
 
 @dataclass
@@ -64,7 +65,9 @@ class _InjectionTally:
     handled: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     changed: Counter[str] = field(default_factory=Counter)
     reached: dict[str, set[tuple[_Key, int]]] = field(default_factory=lambda: defaultdict(set))
-    """The messages that at least one agent handled."""
+    """Message type -> the messages that at least one agent handled. The number with each message distinguishes its
+    copies.
+    """
 
 
 def account(scenario: Scenario, archive: RunArchive) -> list[RogueInjection]:
@@ -109,7 +112,9 @@ def in_words(injection: RogueInjection) -> str:
 
 
 def describe_handling(messages: InjectedMessages) -> str:
-    """Return the number of handler runs for each result as text, such as "held already 4, committed 1"."""
+    """Return the number of handler runs for each result as text, such as "held already 4, committed 1, 2 handled by no
+    agent". Return "unknown" if the traces do not show the results.
+    """
     done = [f"{branch} {count}" for branch, count in messages.handled.items()]
     return (
         ", ".join([*done, *([f"{messages.unhandled} handled by no agent"] if messages.unhandled else [])]) or "unknown"
@@ -135,8 +140,8 @@ def _count_line(
 
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
-    """Return the handler runs that injected messages may have triggered, grouped by message. If a replayed copy cannot
-    be distinguished from its original, the handler runs for the original are included.
+    """Return the handler runs that injected messages may have triggered, by message. If an injected copy equals its
+    original, the runs that the original triggered are included.
     """
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:
@@ -151,8 +156,8 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
 def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
-    """Yield each handler run that an injected message triggered, with the number of the injection and the index of the
-    copy. The last handler runs for a message are assigned to its last copies.
+    """Assign the handler runs for a message to the injected copies of the message, the last run to the last copy. Yield
+    the number of the injection, the index of the copy, and the handler run.
     """
     forged = injection_of(key[1])
     if copies is None and forged is not None:

@@ -39,14 +39,15 @@ from ucp.trace import HandlerRun, RecordedBytes, StateSummary
 from ucp.trigger import BootTrigger, LocalTrigger, MessageTrigger
 
 MAX_PLACES, MAX_SHARE = 3, 0.1
-"""Limits for each kind of contradiction: the number of places, and the share of the lines that could show the
-contradiction. If both limits are exceeded, the agent probably interprets the trace format differently.
+"""Limits for each kind of contradiction: an absolute number of places, and a share of the lines that could show it. If
+a kind exceeds both limits, the agent probably interprets the trace format differently, so this kind proves nothing.
 """
 
 
 def lost_lines(trace: Trace) -> dict[int, str]:
-    """Return the handler runs whose errors a lost line may explain, each with a reason such as "lines are missing ...".
-    The key is the number of earlier handler runs, as in `Trace.gaps`.
+    """Return the places at which lines of the trace seem to be lost, each with a reason such as "lines are missing
+    ...". The key is the number of handler runs before the place, as in `Trace.gaps`. A lost line may explain an error
+    of the handler run after the place.
     """
     found: dict[int, str] = {}
     kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()
@@ -67,7 +68,7 @@ class _ContradictionPlaces:
     def __init__(self) -> None:
         self.found: dict[int, str] = {}
         self.places = self.possible = 0
-        """Number of places, and number of trace lines at which the contradiction could occur."""
+        """Number of places found so far, and number of trace lines at which the contradiction could have occurred."""
 
 
 def _jumps(runs: Sequence[HandlerRun], start: int, end: int, known: set[int], kind: _ContradictionPlaces) -> None:
@@ -168,7 +169,9 @@ def lacking_traces(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def _boots_from_unknown(trace: Trace) -> str | None:
-    """Return a reason if the agent booted from a disk that an unrecorded incarnation wrote. Return None otherwise."""
+    """Return a reason if the agent restarted from a disk whose content no recorded incarnation wrote. Return None
+    otherwise. An incarnation is the time between two restarts.
+    """
     completed: set[str] = set()
     for start, end in pairwise([0, *trace.starts, len(trace.runs)]):
         runs = trace.runs[start:end]
@@ -207,7 +210,7 @@ def _unsent(traces: Mapping[int, Trace]) -> Iterator[tuple[int, str]]:
 
 
 def was_running(trace: Trace, timestamp_us: int) -> bool:
-    """Return true if a recorded incarnation of the agent was running at this timestamp of the agent's clock."""
+    """Return true if the agent was running at this timestamp of its clock, according to its trace."""
     at_s = mission_s(timestamp_us, trace.header)
     if at_s is None:
         return False
@@ -219,10 +222,10 @@ def was_running(trace: Trace, timestamp_us: int) -> bool:
 
 
 def may_be_of_missing_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return true if the author of the block may have completed it in an unrecorded incarnation.
+    """Return true if the author of the block may have completed it between two restarts that no record covers.
 
-    Only run.json lists all incarnations. Without it, the trace of an agent shows the times of its incarnations, and an
-    export lists only the blocks of the last incarnation.
+    Only run.json lists all restarts. Without it, the trace of an agent shows the times at which the agent ran, and an
+    export lists only the blocks that the agent completed since its last restart.
     """
     if evidence.record is not None:
         return False

@@ -32,7 +32,7 @@ class NotOnRecordError(Exception):
 
 
 def decoded(record: RecordedBytes | None) -> Datagram:
-    """Decode a recorded datagram. Raises MalformedDatagramError if the bytes are invalid."""
+    """Decode a recorded datagram. Raises MalformedDatagramError if it is not a valid message."""
     if record is None:
         return _decoded("")
     content = record.content
@@ -63,8 +63,8 @@ def event_of(record: RecordedBytes | None) -> LoggableEvent:
 
 
 def sealed_of(record: RecordedBytes | None) -> bytes | None:
-    """Return the encrypted event data that an agent recorded. Return None if the record contains no encrypted event
-    data or no valid base64.
+    """Return the encrypted event data that an agent recorded for a block. Return None if the record contains none, or
+    no valid base64.
     """
     try:
         return None if record is None else base64.b64decode(record.text, validate=True)

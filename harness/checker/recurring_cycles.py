@@ -1,9 +1,10 @@
-"""Find the cycle that agents repeat forever. The evidence is a proof in virtual time, or the traces.
+"""Find the cycle that agents repeat forever. In virtual time, the simulation can prove the cycle. In other runs, the
+traces are the evidence.
 
 A trace shows a cycle if it ends with several repetitions of the same sequence of handler runs. In each repetition, the
-chain and the numbers of blocks in deque and stack are the same. A trace shows a standstill if the agent is not idle and
-ran no handler for longer than its longest timer. Agents that make progress change their chains, so their traces show
-neither a cycle nor a standstill.
+chain and the numbers of blocks in deque and stack are the same. A trace shows a standstill if the agent is not idle,
+but ran no handler for longer than its longest timer. An agent that makes progress changes its chain, so its trace shows
+neither.
 """
 
 from collections import defaultdict
@@ -19,22 +20,26 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
-"""Number of consecutive repetitions from which a sequence of handler runs counts as a cycle."""
+"""Minimum number of consecutive repetitions of a sequence of handler runs that counts as a cycle."""
 LAST_RUNS = 20_000
-"""Number of handler runs at the end of a trace in which the checker searches for a cycle."""
+"""Number of handler runs at the end of a trace in which the checker searches for a cycle. The limit bounds the time of
+the search.
+"""
 COUNTED = {
     "receive_phase_1_response": ("yes", "no"),
     "receive_response_next_in_sequence": ("new candidate", "counted"),
 }
 """Handlers that receive answers during a reconcile -> the branches in which the handler counts the answer."""
 ALREADY = "already in progress"
-"""Branch that Algorithm 7 takes if the agent is already in a reconcile."""
+"""Branch (result) of Algorithm 7, Reconcile Begin, if the agent already reconciles."""
 REFUSED = ("receive_vote_add_block", "no")
 ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
 SHORTEST_PAUSE_S = 0.05
-"""Mission seconds of the shortest pause between two handler runs that the description of a cycle mentions."""
+"""Minimum number of mission seconds between two handler runs for which the description of a cycle mentions the
+pause.
+"""
 
 
 def cycle_of(evidence: Evidence) -> Cycle | None:
@@ -68,7 +73,7 @@ def _last_ran_s(evidence: Evidence, standstill: Cycle) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _CyclePart:
-    """One agent's part of an endless cycle."""
+    """The handler runs that one agent repeats in an endless cycle."""
 
     runs: list[HandlerRun]
     """The handler runs of one period."""
@@ -126,9 +131,10 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 
 
 def _own_runs(trace: Trace) -> list[HandlerRun]:
-    """Return the last handler runs of an agent since its last restart.
+    """Return the handler runs since the agent's last restart, at most the last `LAST_RUNS`.
 
-    Runs for messages that changed no blocks are omitted.
+    The result omits handler runs that cannot be part of a cycle of the agent itself: runs for messages that changed no
+    blocks, and attempts to start a reconcile during a reconcile.
     """
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))
@@ -171,8 +177,8 @@ def _matches(keys: Sequence[object]) -> list[int]:
 
 
 def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -> Iterator[CycleWait]:
-    """Yield for each agent the reasons why it waits: the peers that gave it no counted answer in the last period, and
-    the peers that rejected its blocks.
+    """Yield for each agent the peers for which it waits: peers that did not answer its questions in the last period,
+    and peers that rejected its blocks.
     """
     for agent_id, each in rounds.items():
         heard, refused_by = set[int](), set[int]()
@@ -195,7 +201,7 @@ def _waits(evidence: Evidence, rounds: dict[int, _CyclePart], period_s: float) -
 
 
 def in_short(cycle: Cycle) -> str:
-    """Return a short phrase about a cycle: the agents that never finish, and the start of the cycle."""
+    """Return a short phrase about a cycle, such as "agents 1 and 2 have repeated the same cycle since 300 s"."""
     many = len(cycle.agents) > 1
     goes = "repeated the same cycle" if cycle.period_s is not None else "hung"
     return f"{named(cycle.agents)} {'have' if many else 'has'} {goes} since {cycle.since_s:.0f} s"
@@ -242,7 +248,7 @@ def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ..
 
 
 def named(ids: Collection[int]) -> str:
-    """Return the names of the agents, or only their number if the list is long."""
+    """Return a phrase such as "agents 1 and 2". For more than `MAX_NAMED` agents, return only their number."""
     return agents(tuple(ids)) if len(ids) <= MAX_NAMED else f"{len(ids)} agents"
 
 
@@ -260,8 +266,8 @@ def findings(cycle: Cycle) -> list[Finding]:
 
 
 def _round_in_words(cycle: Cycle, agent_id: int) -> str:
-    """Return a text that lists the handler runs of one period. The text starts after the longest pause, so equal cycles
-    give equal texts.
+    """Return a text that lists the handler runs of one period of an agent. The list starts after the longest pause, so
+    that agents with the same cycle get the same text.
     """
     steps = [step for step in cycle.steps if step.agent_id == agent_id]
     if not steps or cycle.period_s is None:

@@ -18,7 +18,7 @@ MAX_SENTENCES = 5
 
 
 def survival(evidence: Evidence) -> Survival:
-    """Return the blocks that each loss of vehicles destroyed, and the smallest number of further vehicles whose loss
+    """Return the blocks that were lost together with vehicles, and the smallest number of further vehicles whose loss
     would destroy a block.
     """
     at_end = _holders(evidence.exports)
@@ -112,8 +112,8 @@ def _losses(evidence: Evidence, lost: list[FaultRecord], at_end: Mapping[str, li
 
 
 def _held_at(trace: Trace, instants: Iterable[float], lost_at: Iterable[float]) -> list[set[str]]:
-    """Return the blocks that an agent held just before each of these times. The set is empty for times after the loss
-    of the agent.
+    """Return the blocks that an agent held just before each of these times. If the agent was lost earlier and has not
+    restarted, the set is empty.
     """
     waiting, blocks_held = deque(instants), []
     held, at_s = HeldBlocks(), -math.inf

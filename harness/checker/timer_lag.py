@@ -17,7 +17,7 @@ class TimerLag:
     """The lateness of vote timers."""
 
     late_s: float
-    """Lateness in mission seconds that one vote timer in twenty exceeded."""
+    """Lateness in mission seconds. Only one in twenty vote timers was later."""
     asked_s: float
     """Requested duration of a vote timer in mission seconds."""
 
@@ -28,8 +28,8 @@ class TimerLag:
 
 
 def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerLag | None:
-    """Return the lateness of the timers of all votes that ran without interruption. Return None if there were too few
-    votes.
+    """Return the lateness of the vote timers of all agents. Votes that a reconcile interrupted do not count. Return
+    None for fewer than `ENOUGH` votes.
 
     If `lag` is given, only the part of the lateness counts that the measured delays of the machine explain.
     """
@@ -51,7 +51,9 @@ def _of_machine(trace: Trace, ended_s: float, late_s: float, lag: MeasuredLag | 
 
 
 def _votes(trace: Trace) -> Iterator[tuple[float, float]]:
-    """Yield the end and the duration of each vote. Votes that a reconcile interrupted are omitted."""
+    """Yield the end and the duration of each vote in mission seconds. Votes that a reconcile interrupted are
+    omitted.
+    """
     for life in trace.incarnations():
         began: float | None = None
         for _, run in life:

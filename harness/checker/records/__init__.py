@@ -4,7 +4,8 @@ Each file in this folder contains a function that compares records in an `Eviden
 unaltered run has no contradiction, because its records also list each kill, restart, reboot, pause, rogue node and full
 disk.
 
-If records contradict each other or are incomplete, `in_doubt` changes the verdict on a characteristic.
+If records contradict each other or are incomplete, the verdict on a characteristic may rest on wrong facts. The
+function `in_doubt` then replaces the verdict.
 """
 
 from collections.abc import Callable, Iterator
@@ -69,7 +70,9 @@ class RecordComparisons:
     """Agent -> number of messages that the agent could not send, according to the agent's own count."""
 
     def touching(self, number: str) -> list[Finding]:
-        """Return the contradictions that affect the characteristic with this number."""
+        """Return the contradictions between records from which the checker derives the characteristic with this
+        number.
+        """
         return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
 
 
@@ -93,7 +96,9 @@ def cross_examine(evidence: Evidence) -> RecordComparisons:
 
 
 def _agents_without_known_end(evidence: Evidence) -> Iterator[int]:
-    """Yield each agent of an interrupted run whose number of handler runs is missing in run.json."""
+    """Yield each agent of an interrupted run for which run.json does not contain the number of handler runs. The end of
+    the agent's trace may then be missing.
+    """
     if evidence.record is None or evidence.record.outcome != "running":
         return
     for agent_id in evidence.traces:
@@ -133,7 +138,9 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def describe_incomplete(examination: RecordComparisons) -> str:
-    """Return a phrase that names the incomplete traces. At least one trace must be incomplete."""
+    """Return a phrase about the incomplete traces, such as "the trace of agent 3 is incomplete: ...". At least one
+    trace must be incomplete.
+    """
     agent_id, why = next(iter(examination.short.items()))
     others = len(examination.short) - 1
     more = f"; so are the traces of {others} more" if others else ""
@@ -141,14 +148,18 @@ def describe_incomplete(examination: RecordComparisons) -> str:
 
 
 NEEDS_TRACES = frozenset("123")
-"""Characteristics that must hold at every step. Without complete traces, they are not known to hold."""
+"""Characteristics that must hold after every step. Without complete traces, the verdict `holds` becomes `not
+applicable`.
+"""
 NEEDS_CONNECTIVITY = frozenset("56")
-"""Characteristics that require full connectivity. An agent that could not send its messages was not connected."""
+"""Characteristics that require full connectivity. If an agent could not send messages, it was not connected, so the
+verdict `violated` becomes `not applicable`.
+"""
 
 
 def in_doubt(number: str, judgement: Judgement, examination: RecordComparisons) -> Judgement:
-    """Return the judgement on the characteristic with this number. Contradictory or incomplete records change its
-    verdict.
+    """Return the judgement on the characteristic with this number. The verdict becomes `violated` if the records behind
+    it contradict each other, and `not applicable` if it needs records that are incomplete.
     """
     touching = examination.touching(number)
     if touching:

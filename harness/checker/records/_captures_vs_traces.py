@@ -21,7 +21,7 @@ duplicated.
 """
 
 Datagrams = Counter[tuple[object, object]]
-"""Number of datagrams for each pair of sender and sequence number."""
+"""Number of datagrams for each sender and sequence number."""
 
 
 def compare_captures(evidence: Evidence) -> Iterator[Contradiction]:
@@ -71,10 +71,10 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the maximum number of messages that are in the agent's trace but were not sent, because of an error or
-    because the agent ended.
+    """Return the maximum number of messages in the agent's trace that the agent never sent.
 
-    A killed agent does not send the messages of its last input. An agent that ends does not send its delayed answers.
+    Sending may have failed. A killed agent does not send the messages of its last handler run. An agent that ends does
+    not send the answers that it had delayed.
     """
     recorded = evidence.recorded(agent_id)
     incarnations = evidence.incarnations[agent_id]
@@ -123,7 +123,7 @@ def compare_counters(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _sent_by(evidence: Evidence, agent_id: int, mission_s: float) -> int:
-    """Return the minimum number of messages that the agent had sent when the kernel's counters were read."""
+    """Return the number of messages that the agent had certainly sent when the kernel's counters were read."""
     trace = evidence.traces[agent_id]
     by = mission_s - slack_s(evidence, trace)
     spread_s = spread_of(trace)

@@ -20,7 +20,9 @@ ROUNDED_S = 5e-4
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each counter of an agent that differs from the number of trace lines that the agent should have counted."""
+    """Yield each counter of an agent in run.json that differs from the number of matching lines in the agent's
+    trace.
+    """
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)
         if recorded is None or trace.problem:
@@ -48,7 +50,7 @@ def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _ran_nothing_since(recorded: AgentRecord, incarnation: ReplayedIncarnation) -> bool:
-    """Return true if the agent ran no handler after it last reported its counters."""
+    """Return true if the agent ran no handler after it last reported its counters to the harness."""
     counted = recorded.handler_runs[-1] if recorded.handler_runs else None
     return counted is None or counted.counted == len(incarnation.runs)
 
@@ -93,7 +95,9 @@ def _handler_runs(
 
 
 def _lines_by(evidence: Evidence, incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
-    """Return the minimum and maximum number of trace lines that existed when the agent reported its counters."""
+    """Return the minimum and maximum number of trace lines that the agent can have written when it reported its
+    counters. The time of the report is known only approximately.
+    """
     if in_virtual_time(incarnation.trace):
         return len(incarnation.runs), len(incarnation.runs)
     slack = ROUNDED_S + (slack_s(evidence, incarnation.trace) if counted.from_s < counted.until_s else 0.0)
@@ -215,8 +219,8 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 def _over_brown_outs(
     evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Yield a contradiction for each restart after which the agent's disk has different completed blocks than before.
-    One line before the power failure may be missing in the trace.
+    """Yield a contradiction for each restart after a power failure for which the agent's disk lacked completed blocks.
+    The disk may contain one additional block, because the last trace line before the power failure may be missing.
     """
     for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):

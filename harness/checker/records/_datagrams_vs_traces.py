@@ -1,13 +1,13 @@
 """Compare the number of datagrams that the kernel delivered to an agent with the datagrams in traces.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
-it ignores. If the agent read more datagrams than these, its trace is incomplete. A datagram that was read at the end of
-an incarnation may be missing, because the agent ended before it handled the datagram. An agent may also use other
-sockets, for example between its processes, so only broadcasts count.
+it ignores. If the agent read more datagrams than these, its trace is incomplete. An agent may end before it handles a
+datagram that it has just read, so datagrams that arrived shortly before the end may be missing. An agent may also use
+other sockets, for example between its processes, so only broadcasts count.
 
-An agent that stops reading its socket also has a trace that looks complete. The module therefore uses the kernel's
-count of broadcasts that arrived at each vehicle. If neither the agent read a broadcast nor the kernel discarded it, the
-broadcast is still in the socket.
+An agent that stops reading its socket also has a trace that looks complete. The module therefore also uses the kernel's
+count of broadcasts that arrived at each vehicle. A broadcast that neither the agent read nor the kernel discarded is
+still in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -20,13 +20,11 @@ from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
-"""Length of the interval before an agent stops, in seconds of wall time. The agent may not have handled a datagram that
-it read in this interval.
+"""Seconds of wall time before an agent stops. The agent may not have handled a datagram that it read in this
+interval.
 """
 UNREAD_WALL_S = 1.0
-"""Length of the interval before an agent stops, in seconds of wall time. The agent may not have read a datagram that
-the kernel delivered in this interval.
-"""
+"""Seconds of wall time before an agent stops. The agent may not have read a datagram that arrived in this interval."""
 
 
 def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
@@ -54,7 +52,7 @@ def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def find_unread(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each agent that left datagrams unread in its socket although it was not paused."""
+    """Yield each agent that left datagrams unread in its socket although it was running."""
     record = evidence.record
     if record is None or set(record.roster) - set(evidence.traces):
         return
@@ -80,8 +78,8 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
 
 
 def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
-    """Return the maximum number of datagrams that were in transit to the agent when it stopped, added over all its
-    stops.
+    """Return the maximum number of datagrams that were in transit to the agent at its stops, added over all stops.
+    `wall_s` is the maximum time of transit in seconds of wall time.
     """
     before_s = _mission_s(trace, wall_s)
     ends = _killed_at(evidence, agent_id)

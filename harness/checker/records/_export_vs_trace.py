@@ -121,8 +121,8 @@ def _value(value: object) -> str:
 
 
 def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -> Iterator[Contradiction]:
-    """Yield the differences between the blocks of an export and the blocks of the trace. The caller has checked that
-    lengths and top chain hash are equal.
+    """Yield the differences between the blocks of an export and the blocks of the trace. Call this function only if the
+    lengths and the top chain hash are equal.
     """
     if incarnation.wrong_lengths or incarnation.wrong_tops or incarnation.impossible or incarnation.unknown:
         return

@@ -26,11 +26,13 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 CLOCK_SLACK_WALL_S = 0.1
-"""Tolerance, in seconds of wall time, for the clocks of the harness and of an agent on one machine."""
+"""Maximum difference between two readings of the machine's clock, in seconds of wall time: one by the harness, one by
+an agent.
+"""
 
 Stop = tuple[float, float, str]
-"""An interval during which an agent was stopped: start and end in mission seconds, and the fault that stopped it. The
-agent may still run at the start and the end.
+"""An interval during which an agent was stopped: start and end in mission seconds, and the fault that stopped it.
+Exactly at the start and at the end, the agent may run.
 """
 
 
@@ -63,8 +65,9 @@ def _clock_slack_s(evidence: Evidence, trace: Trace) -> float:
 
 
 def stopped(evidence: Evidence, agent_id: int, slack_s: float) -> list[Stop]:
-    """Return the intervals in which the agent was killed, rebooting, switched off or paused, or had failed. Each
-    interval is shortened by `slack_s` at both ends.
+    """Return the intervals during which the agent was killed, rebooting, switched off or paused, or had failed. Each
+    interval begins `slack_s` later and ends `slack_s` earlier than recorded, so that a small difference of clocks
+    causes no finding.
     """
     stops = list(_failed(evidence, agent_id, slack_s))
     since: tuple[float, str] | None = None
@@ -114,7 +117,9 @@ class _CutIntervals:
     def __init__(self, link_losses: list[tuple[float, dict[Link, float]]], slack_s: float) -> None:
         self.slack_s = slack_s
         self._times: dict[Link, list[float]] = defaultdict(list)
-        """Link -> the mission seconds at which the link was alternately cut and restored. The first one is a cut."""
+        """Link -> mission seconds at which the link changed. The first change cut the link, the second restored it, and
+        so on.
+        """
         for at_s, losses in link_losses:
             for link, loss in losses.items():
                 times = self._times[link]
@@ -122,7 +127,9 @@ class _CutIntervals:
                     times.append(at_s)
 
     def cut_at(self, link: Link, sent_s: float) -> bool:
-        """Return true if the link was cut at this time, and also shortly before and after it."""
+        """Return true if the link was certainly cut at this time: it was cut from `slack_s` before this time until
+        `slack_s` after it.
+        """
         times = self._times.get(link, [])
         from_s, until_s = sent_s - self.slack_s, sent_s + self.slack_s
         number = bisect_right(times, from_s)
@@ -130,10 +137,12 @@ class _CutIntervals:
 
 
 def _cuts(evidence: Evidence) -> _CutIntervals | None:
-    """Return the intervals in which links were cut. Return None if no link was cut, or if a cut link may pass messages.
+    """Return the intervals in which links lost all messages. Return None if there are none, or if a message may arrive
+    over such a link.
 
-    A cut link may pass messages in three cases. Scripted fates deliver messages regardless of the loss. netem may pass
-    the second copy of a lost message. On a shared channel a message waits before it is sent.
+    A message may arrive in three cases. The scenario decides the fate of each message in its section `fates`. The
+    network emulator netem loses the first copy of a message, but passes the second one. On a shared channel, the
+    message waits until after the cut.
     """
     if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.requested_links or ()):
         return None

@@ -51,7 +51,9 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _may_duplicate(evidence: Evidence) -> bool:
-    """Return true if the network or a script may deliver a message twice, or if no record describes the network."""
+    """Return true if a message may arrive twice: the network duplicates messages, the scenario decides the fate of each
+    message, or no record describes the network.
+    """
     links = evidence.requested_links
     return links is None or evidence.has_fates or any(link.duplicate > 0 for link in links)
 
@@ -86,8 +88,8 @@ def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """Return the block that the agent added to its chain if the message carried a different block. Otherwise return
-    None.
+    """Return the block that the agent added to its chain if the handled message carried a different block. Return None
+    if the message carried this block or carries no block.
     """
     if trigger.message not in CARRY_A_BLOCK:
         return None

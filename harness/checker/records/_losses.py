@@ -45,40 +45,44 @@ from ucp.messages import BlockAddRequest, ChainContainQuery, CommitBlock
 from ucp.trigger import MessageTrigger
 
 NEVER_WITHHELD = frozenset(message.NAME for message in (BlockAddRequest, CommitBlock, ChainContainQuery))
-"""Types of messages that virtual time always delivers to an agent that does not reconcile. It omits other messages
-without effect.
+"""Types of messages that the simulation always delivers to an agent that does not reconcile. To save time, the
+simulation does not deliver other messages that the agent would ignore.
 """
 
 _SentMessage = tuple[float, tuple[int, str, int]]
 """A sent message: the mission second, and the message as (sender, type, sequence number)."""
 
 MAX_CHANCE = 1e-12
-"""Probability below which an observation counts as impossible."""
+"""Probability below which the checker considers an observation impossible."""
 
 
 @dataclass
 class _ExpectedDeliveries:
-    """The messages that one receiver should get."""
+    """The messages that one receiver would handle in a network without loss, and the number that it really handled."""
 
     messages: int = 0
-    """Number of messages that the receiver should get."""
+    """Number of messages that the receiver would handle in a network without loss."""
     least: float = 0.0
-    """Sum of the smallest loss probability that is possible for each message."""
+    """Sum of the loss probabilities (0 to 1) of these messages. For each message, it contains the smallest probability
+    that the records allow.
+    """
     most: float = 0.0
-    """Sum of the largest loss probability that is possible for each message."""
+    """Sum of the loss probabilities (0 to 1) of these messages. For each message, it contains the largest probability
+    that the records allow.
+    """
     handled: int = 0
-    """Number of messages that the receiver handled."""
+    """Number of these messages that the receiver handled."""
     dropped: int = 0
     """Recorded datagrams that arrived at the receiver, but that the receiver did not handle. Some of these datagrams
     may be among `messages`.
     """
 
     def loss_range(self) -> tuple[float, float]:
-        """Return the minimum and maximum of the mean loss rate of these messages."""
+        """Return the smallest and the largest possible mean loss probability of these messages."""
         return self.least / self.messages, self.most / self.messages
 
     def pass_range(self) -> tuple[float, float]:
-        """Return the minimum and maximum of the mean probability that these messages arrive."""
+        """Return the smallest and the largest possible mean probability that these messages arrive."""
         return 1 - self.most / self.messages, 1 - self.least / self.messages
 
     def add(self, losses: tuple[float, float]) -> None:
@@ -88,7 +92,7 @@ class _ExpectedDeliveries:
 
 
 class _LossHistory:
-    """The probability that no copy of a message passes a link, at each time of the run."""
+    """The probability that a link loses a message together with its duplicates, at each time of the run."""
 
     def __init__(
         self,
@@ -109,11 +113,12 @@ class _LossHistory:
         self._fewest = [min(shares) for shares in single]
         self._most = [max(shares) for shares in single]
         self._ranges: dict[tuple[Link, int, int, int, int], tuple[float, float]] = {}
-        """The results of `range_at`, by link and by the positions of the values that are in effect."""
+        """A cache of the results of `range_at`. The key consists of the link and of the values that are in effect."""
 
     def range_at(self, link: Link, sent_s: float) -> tuple[float, float]:
-        """Return the minimum and maximum probability that the link loses all copies at this time. The clock slack
-        before and after this time is included.
+        """Return the smallest and the largest probability that the link loses a message, sent at `sent_s`, together
+        with its duplicates. The probability may have changed around this time, and the clocks of agents and harness may
+        differ by `slack_s`.
         """
         earliest, latest = sent_s - self._slack_s, sent_s + self._slack_s
         times, changed_at = self._times[link], self._changed_at
@@ -131,8 +136,9 @@ class _LossHistory:
         return found
 
     def _around(self, values: list[float], first: int, end: int) -> list[float]:
-        """Return the values in effect during the clock slack around a time. `first` and `end` are the numbers of values
-        that took effect before the slack and until its end.
+        """Return the values that may have been in effect at a time. `first` is the number of values that took effect
+        before the tolerance interval around this time. `end` is the number of values that took effect until the end of
+        the interval.
         """
         first = max(0, first - 1)
         return values[first : max(first + 1, end)]
@@ -189,10 +195,11 @@ def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> boo
 
 
 def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _ExpectedDeliveries]:
-    """Return, for each receiver, the messages that a correct agent handles if they arrive, with their loss
-    probabilities.
+    """Return for each receiver the messages that it would handle in a network without loss, with the probabilities that
+    they are lost.
 
-    If `over_cuts` is given, it contains the minimum and maximum loss probability for messages over cut links.
+    `over_cuts` is the smallest and the largest loss probability to use for messages over a cut link. If it is None,
+    such messages are lost with probability 1.
     """
     slack = max([SAME_TIME_S, *(slack_s(evidence, trace) for trace in evidence.traces.values())])
     history = _LossHistory(evidence.link_losses, evidence.requested_conditions or [], slack)
@@ -230,10 +237,11 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 def _sent(evidence: Evidence, counted: frozenset[str] | None, duplicates: bool) -> dict[int, list[_SentMessage]]:
-    """Return the messages of these types that each agent sent. None stands for all types.
+    """Return the messages that each agent sent, if their type is in `counted`. If `counted` is None, return messages of
+    all types.
 
-    If the network duplicates messages, the result omits messages that two incarnations of an agent sent. It is unknown
-    whose copies a receiver handled.
+    If the network duplicates messages, the result omits each message that an agent sent both before and after a restart
+    under the same sequence number. A receiver cannot distinguish the copies of these messages.
     """
     return {
         sender: [
@@ -249,7 +257,9 @@ def _sent(evidence: Evidence, counted: frozenset[str] | None, duplicates: bool) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in virtual time handles every message of the types `counted`."""
+    """The times at which an agent in the simulation handles every message that arrives. At other times, the agent is
+    stopped, or it reconciles and ignores messages. `counted` contains the message types to which this applies.
+    """
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:
         self.counted = MESSAGES if evidence.delivers_all else NEVER_WITHHELD
@@ -271,7 +281,7 @@ class _ReadyTimes:
         self._end_s = evidence.end_of(agent_id) or 0.0
 
     def handles(self, sent_s: float) -> bool:
-        """Return true if the agent would handle the message at every possible time of its arrival."""
+        """Return true if the agent handles a message that was sent at `sent_s`, whatever its latency."""
         arrives_s = sent_s + self._latest_s
         if arrives_s >= self._end_s:
             return False
@@ -310,9 +320,9 @@ def _compare_counters(evidence: Evidence, links: set[LinkConditions]) -> Iterato
 
 
 def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer: bool) -> bool:
-    """Return true if `count` is practically impossible as the number of successes in `number` random draws. `means` is
-    a lower and an upper bound of the mean probability of a success. If `fewer` is true, the function tests whether the
-    count is too low. Otherwise it tests whether the count is too high.
+    """Return true if chance cannot explain `count` successes in `number` random draws. `means` is a lower and an upper
+    bound of the mean probability of a success. If `fewer` is true, the function tests whether there are too few
+    successes, otherwise whether there are too many.
     """
     share = min(1.0, count / number)
     mean = min(1.0, max(0.0, means[0] if fewer else means[1]))
@@ -322,7 +332,9 @@ def _is_impossible(count: int, number: int, means: tuple[float, float], *, fewer
 
 
 def _relative_entropy(share: float, mean: float) -> float:
-    """Return the relative entropy of `share` and `mean` in nats, or infinity if the share is impossible."""
+    """Return the relative entropy of two draws with the probabilities `share` and `mean`, in nats. Return infinity if
+    `mean` makes `share` impossible.
+    """
     if mean in (0.0, 1.0):
         return 0.0 if share == mean else float("inf")
     parts = ((share, mean), (1 - share, 1 - mean))

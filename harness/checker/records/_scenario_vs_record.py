@@ -1,8 +1,8 @@
 """Compare the scenario with the changes, agents and duration that run.json records.
 
-The scenario determines all network changes, faults and injections before the run. If a record lacks one of them or has
-an additional one, it belongs to a different run. Three kinds of changes are not in the scenario: changes by the
-movement of vehicles, the end of scripted fates, and the lossless network during the final reconcile.
+The scenario fixes all network changes, faults and injections before the run. If run.json lacks one of them or has an
+additional one, it belongs to a different run. Three kinds of changes are not in the scenario: changes because vehicles
+move, the end of the section `fates`, and the lossless network during the final reconcile.
 """
 
 from collections.abc import Iterator
@@ -28,12 +28,12 @@ USUAL = Settings()
 NOT_IN_A_SCENARIO = (RANGE, NO_MORE_FATES, FINAL_RECONCILE)
 
 LATE_WALL_S = 60.0
-"""Maximum lateness of a change in seconds of wall time. This limit applies to runs with processes, because their
-records lack the planned time of the change.
+"""Maximum delay of a change in seconds of wall time. The limit applies to runs with real processes, whose records
+contain only the actual time of a change.
 """
 
 Made = tuple[str, str]
-"""The name and the description of a change."""
+"""The name and the description of a change of the network or of agents."""
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:

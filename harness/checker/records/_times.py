@@ -22,11 +22,15 @@ from ucp.trigger import EventTrigger
 END_WALL_S = 60.0
 """Maximum number of seconds of wall time that the harness takes to end all agents."""
 ROUNDED_END_S = 0.1
-"""Rounding error in seconds of the end time in run.json, which has tenths of a second except in virtual time."""
+"""Rounding error in seconds of the end time in run.json. A simulated run records the exact time, every other run
+records tenths of a second.
+"""
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export, handler run and event whose time contradicts the end time of the run or the agent's clock."""
+    """Yield each export and handler run that is later than the end of the run allows, each export that is too early,
+    and each event whose timestamp differs from the time at which the agent logged it.
+    """
     as_logged = not _has_recorded_events(evidence)
     for agent_id, trace in evidence.traces.items():
         end_s = evidence.end_of(agent_id)
@@ -41,8 +45,8 @@ def compare(evidence: Evidence) -> Iterator[Contradiction]:
 
 
 def _around_the_end(evidence: Evidence, trace: Trace, end_s: float) -> tuple[float, float]:
-    """Return the earliest possible time of the export, and the latest possible time of the export and of
-    handler runs.
+    """Return the earliest and the latest possible time of the export in mission seconds. The latest time also applies
+    to handler runs.
     """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):
@@ -88,8 +92,8 @@ def _compare_events(evidence: Evidence, agent_id: int, trace: Trace) -> Iterator
 
 
 def _time_of_event(run: HandlerRun, trace: Trace) -> float | None:
-    """Return the mission second of the event's timestamp. Return None if this time is unknown. An event has the
-    timestamp 0 if the clock shows a time before its epoch.
+    """Return the mission second of the event's timestamp. Return None if it is unknown. The timestamp is 0 if the
+    agent's clock showed a negative time. The function then returns at most the time of the handler run.
     """
     try:
         timestamp_us = event_of(run.input).timestamp_us

@@ -11,11 +11,11 @@ from ucp.clock import MICROSECONDS
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A contradiction between two records."""
+    """A contradiction between two records of the same run, for example between a trace and an export."""
 
     finding: Finding
     touches: str | None = None
-    """Number of the characteristic that depends on the two records. None if no characteristic depends on them."""
+    """Number of the characteristic whose verdict uses these records. None if no characteristic uses them."""
     short: bool = False
     """True if the contradiction shows that lines are missing in the trace of the agent."""
 
@@ -26,7 +26,7 @@ def of_agent(agent_id: int, detail: str, touches: str | None = None, *, short: b
 
 
 ROUNDED_S = 2e-6
-"""Rounding error in seconds of the times in traces. These times have microseconds."""
+"""Maximum rounding error in seconds of two compared times in traces, which are rounded to microseconds."""
 
 
 def in_virtual_time(trace: Trace) -> bool:
@@ -36,7 +36,8 @@ def in_virtual_time(trace: Trace) -> bool:
 
 def slack_s(evidence: Evidence, trace: Trace) -> float:
     """Return the tolerance for differences between clocks, in mission seconds. A simulated run has only one clock, so
-    its tolerance is 0. The tolerance for a clock of another computer includes the measured error of the clock.
+    its tolerance covers only rounding. The tolerance for a clock of another computer includes the measured error of the
+    clock.
     """
     speedup = trace.header.clock.get("speedup")
     if in_virtual_time(trace) or not isinstance(speedup, int | float):

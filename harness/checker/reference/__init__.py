@@ -1,4 +1,4 @@
-"""The independent implementation of the protocol with which the steps of an agent are compared.
+"""The independent implementation of the protocol. The checker compares each step of an agent with it.
 
 `algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from
 `docs/reference/readings.md`, the interpretations of its ambiguous passages, and did not see `ucp`. The two

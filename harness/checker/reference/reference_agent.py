@@ -32,8 +32,8 @@ class StoredBlocks(Protocol):
 
 
 class ReferenceAgent:
-    """An agent that follows the reference implementation. All times are mission seconds. Callers may read and set the
-    attribute `state`. The agent calls `after_each` after each handler run.
+    """An agent that follows the reference implementation. All times are mission seconds. The attribute `state` is
+    public: callers may change it to put the agent into any state. The agent calls `after_each` after each handler run.
     """
 
     def __init__(

@@ -137,8 +137,8 @@ class Handler:
     run: Callable[..., str]
     """The function that performs the Algorithm."""
     tally: str | None = None
-    """Name of the attribute of the state in which the handler counts votes or answers, or stores the chosen block. None
-    if the handler does neither.
+    """Name of the attribute of `ReferenceState` in which the handler counts votes or answers, or stores the chosen
+    block. None for all other handlers.
     """
 
 
@@ -203,11 +203,15 @@ class ReferenceState:
         return block_hash in self.chain or block_hash in self._off_chain
 
     def note_held(self) -> None:
-        """Update the set of held blocks. Call this method after replacing the deque or the reconcile stack."""
+        """Recompute the set of blocks in the deque and on the reconcile stack, which `holds` uses. Call this method
+        after replacing the deque or the reconcile stack.
+        """
         self._off_chain = {block.block_hash for block in (*self.blocks_to_be_committed, *self.reconcile_stack)}
 
     def event_data(self, timestamp_us: int) -> bytes:
-        """Return the event data of the block under construction. `timestamp_us` will be the timestamp of the block."""
+        """Return the event data of the block under construction. This class ignores `timestamp_us`, the timestamp of
+        the block. A subclass may need it to encrypt the data.
+        """
         return bytes(self.current_block)
 
     def send(self, message: Message) -> None:
@@ -266,8 +270,8 @@ class ReferenceState:
         """Load the state that the agent stored before a power failure, and start the agent as if a reconcile were in
         progress.
 
-        `completed` contains block hashes. The method records the change "complete" for them without calling `changed`,
-        because the agent may no longer hold these blocks.
+        `completed` contains the hashes of all blocks that the agent completed. The trace line of the restart lists
+        them. The agent may no longer hold some of these blocks, so they are recorded without calling `changed`.
         """
         self.reconcile_in_progress = True
         self.completed = list(completed)

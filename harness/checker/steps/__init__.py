@@ -40,11 +40,11 @@ def first_cause(judgement: Judgement | None) -> str | None:
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Return the verdict on all steps. The verdict is `deviates` after any difference from the reference, `not
-    applicable` if a step could not be judged, and `as specified` otherwise.
+    """Return the verdict on all steps: `deviates` after any difference from the reference, `not applicable` if a step
+    could not be judged, and `as specified` otherwise.
 
-    The verdict is also `deviates` if the judge cannot be trusted, because an edit broke code that it shares with the
-    agents.
+    The judge and the agents share some code, such as the codec of messages. The verdict is also `deviates` if an edit
+    broke this code, because the judge then cannot be trusted.
     """
     judgement = _compare(evidence) if evidence.steps is None else evidence.steps
     if (defect := _shared_code.defect()) is not None:
@@ -123,8 +123,8 @@ def _followers(evidence: Evidence, trace: Trace, header: CheckedHeader, blocks: 
 
 
 def _follow(evidence: Evidence, agent_id: int, trace: Trace, followers: list[StepComparer]) -> None:
-    """Compare each incarnation of the agent with the reference, up to the first step that contains an undefined
-    name.
+    """Compare the steps of the agent with the reference. The comparison stops before the first step that contains a
+    name that the agent contract does not define, for example of a handler.
     """
     understood = not evidence.unknown.get(agent_id, {}).keys() - IGNORED_KINDS
     for follower, life in zip(followers, trace.incarnations(), strict=True):
@@ -157,8 +157,8 @@ def wrongly_dropped(header: CheckedHeader, line: int, aside: DroppedDatagram | C
 
 
 def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lost: list[str]) -> Judgement:
-    """Return the judgement for the deviations of all agents. `lost` contains the reasons why some steps could not be
-    judged.
+    """Return the judgement for the deviations of all agents. `steps` is the number of compared steps. `lost` contains
+    the reasons why some steps could not be compared.
     """
     deviations.sort(key=lambda deviation: (deviation.t, deviation.agent_id, deviation.line))
     first_unknown: dict[tuple[int, str | None], StepDeviation] = {}
@@ -179,7 +179,7 @@ def deviates(evidence: Evidence, deviations: list[StepDeviation], steps: int, lo
 
 
 def _known(deviation: StepDeviation) -> str | None:
-    """Return the handler of the deviation if it is one of the 20 handlers of the protocol. Return None otherwise."""
+    """Return the name of the handler that deviated. Return None if it is none of the 20 handlers of the protocol."""
     return deviation.handler if deviation.handler in HANDLERS else None
 
 

@@ -1,8 +1,10 @@
 """An agent core that can adopt the state that another agent recorded. A comparison can then continue after a deviation.
 
-After a deviation the judge continues from the agent's own state. `AdoptingCore` adds this ability to any core that has
-the attributes of the reference's `ReferenceState`. Two cores use this: the reference, which judges the agents, and the
-installed core, for a debugger and for `bisect` (`harness.checker.steps.core_in_use`).
+The judge gives the recorded inputs of an agent to a core of its own. After a deviation, the core and the agent are in
+different states, and all later steps would differ too. `AdoptingCore` therefore replaces the core's state by the
+agent's own state. It can extend any core that has the attributes of the reference's `ReferenceState`. Two cores use it:
+the reference, which judges the agents, and the installed core, for a debugger and for `bisect`
+(`harness.checker.steps.core_in_use`).
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,7 +27,7 @@ from ucp.trace import HandlerRun, SentMessage
 
 
 class StateBeforeStep(NamedTuple):
-    """The parts of the state before a step that cannot be restored from the step's recorded changes."""
+    """The parts of the state before a step that the recorded changes of the step do not determine."""
 
     stack: list[Block]
     current_block: bytes | None
@@ -40,15 +42,15 @@ else:
 
 
 class AdoptingCore(_Core):
-    """An agent core that can undo its last step (`undo`), and adopt the recorded step of another agent in place of its
-    own step (`adopt`).
+    """An agent core that can undo its last step (`undo`), and instead take over the step that another agent recorded
+    (`adopt`).
     """
 
     def __init__(self, agent_id: int, initial_data: bytes, settings: Any) -> None:
         super().__init__(agent_id, initial_data, settings)
         self.recorded_seal: bytes | None = None
-        """The encrypted event data of this step, as the agent recorded them. The core cannot encrypt event data without
-        the agent's keys.
+        """The encrypted event data that the agent recorded for this step. The core lacks the agent's keys, so it cannot
+        encrypt event data itself.
         """
         self._seals = sealed_to(initial_data) is not None
         self._moved: dict[str, Block] = {}
@@ -130,8 +132,8 @@ class AdoptingCore(_Core):
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Select the block that the agent's recorded run selected for phase 3. This selection is necessary after a
-        deviation, if the agent started phase 3 but the core did not.
+        """Select the same block for phase 3 of the reconcile as the agent did. Without this, the core could have
+        selected no block, if the agent started phase 3 only because of an earlier deviation.
         """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]
@@ -143,7 +145,8 @@ class AdoptingCore(_Core):
         """Undo the changes that the last step made to blocks and timers. The votes are not restored, because `adopt`
         replaces them.
 
-        `before` is None if the recorded changes are sufficient to undo the step.
+        `before` is the result of the method `before`. It is None if the recorded changes are sufficient to undo the
+        step.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:
@@ -228,7 +231,9 @@ class AdoptingCore(_Core):
             self.chain.top_chain_hash = chain_hash
 
     def _adopt_sent(self, sent: Iterable[SentMessage]) -> None:
-        """Start the timers for the queries and requests among these sent messages."""
+        """Start the timers that belong to the sent messages. A vote, a query and a request each start the timer that
+        limits the wait for answers.
+        """
         for announced in sent:
             self.sequence = announced.seq + 1
             try:
@@ -239,8 +244,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Prepare to count the answers to `message`. Return the timer that limits the wait for these answers. Return
-        None if the message needs no answer.
+        """Set the counters of the answers to `message` to their initial values. Return the timer that limits the wait
+        for these answers. Return None if the message expects no answer.
         """
         match message:
             case BlockAddRequest():

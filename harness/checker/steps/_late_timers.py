@@ -28,8 +28,8 @@ ENOUGH = 8
 
 @dataclass
 class JudgedTimers:
-    """The number of judged timer expiries of all agents, and the number of expiries for which the delay of the machine
-    was not measured.
+    """The numbers of timer expiries of all agents: those that were judged, and those among them for which the delay of
+    the machine was not measured.
     """
 
     expiries: int = 0
@@ -37,7 +37,7 @@ class JudgedTimers:
 
     @property
     def remark(self) -> str:
-        """A remark about timers that could not be judged. It is an empty text if all timers were judged."""
+        """A remark for the verdict if some timers could not be judged. Empty if all timers were judged."""
         if not self.unmeasured:
             return ""
         which = "timers" if self.unmeasured == self.expiries else f"{self.unmeasured} of {self.expiries} timers"
@@ -69,7 +69,9 @@ class JudgedTimers:
 def _in_virtual_time(
     evidence: Evidence, agent_id: int, expiries: Sequence[RecordedTimerExpiry]
 ) -> Iterator[StepDeviation]:
-    """Yield each expiry that is later than the delays of the scenario explain. Virtual time has no lag."""
+    """Yield each expiry that came later than the delays in the scenario explain. A simulated machine causes no other
+    delays.
+    """
     for expiry in expiries:
         due_s = expiry.t - max(0.0, expiry.late_s)
         if expiry.late_s > ROUNDING_S and not evidence.was_delayed(agent_id, due_s, expiry.t):
@@ -80,8 +82,8 @@ def _in_virtual_time(
 def _of_kind(
     agent_id: int, timer: str, expiries: list[tuple[RecordedTimerExpiry, float]], speedup: float
 ) -> Iterator[StepDeviation]:
-    """Yield each expiry of this timer that was too late. If no single expiry was too late, but the mean lateness is too
-    high, yield the last expiry.
+    """Yield each expiry of this timer that was too late. If each single delay is acceptable but their mean is too high,
+    yield the last expiry.
     """
     late = [(expiry, lag_s) for expiry, lag_s in expiries if expiry.late_s > lag_s + SINGLE_WALL_S * speedup]
     for expiry, lag_s in late:

@@ -30,17 +30,21 @@ from ucp.trace import HandlerRun, RecordedBytes, SentMessage
 from ucp.trigger import MessageTrigger
 
 SHARED = ("_dataclass", "block", "events", "messages", "plain_file", "sealed", "trace", "trigger", "wire")
-"""The modules of `ucp` that the judge imports, and those that they import."""
+"""The modules of `ucp` that the judge imports, together with the modules that these modules import."""
 NAME_A_BLOCK = ("block_hash", "block")
 """Fields of a message that name a block."""
 VECTORS = Path(ucp.__file__).parent / "contract" / "vectors"
 OF_THE_ROSTER = ("own sender", "sender not on the roster", "block not of the roster")
-"""Reasons for which an agent drops a valid datagram."""
+"""Reasons for which an agent drops a datagram that the codec accepts. The codec does not know the roster, the list of
+all agents.
+"""
 
 
 @cache
 def edited() -> tuple[str, ...]:
-    """Return the edited files of the shared code, and the edited file of settings, such as "ucp/trace.py"."""
+    """Return the edited files among those that the judge shares with the agents, such as "ucp/trace.py". The file with
+    the settings is included.
+    """
     checked = {f"ucp/{name}.py" for name in (*SHARED, "settings")}
     return tuple(file for file in edited_files() if file in checked)
 
@@ -60,7 +64,7 @@ def defect() -> str | None:
 
 
 def broken_files() -> str | None:
-    """Return the edited files of the shared code if a test vector contradicts them. Return None otherwise."""
+    """Return the names of the edited shared files if a test vector contradicts them. Return None otherwise."""
     return " and ".join(edited()) if defect() is not None else None
 
 
@@ -160,7 +164,7 @@ def _missions() -> Iterator[str]:
 
 
 def _is_read(run: HandlerRun, recorded: dict[str, Any]) -> bool:
-    """Return true if a handler run, read from a trace line, has the values in this line."""
+    """Return true if the handler run, which was read from a trace line, contains the values of this line."""
     trigger: dict[str, Any] = recorded["trigger"]
     kind = next(iter(trigger))
     if (run.trigger.kind, run.trigger.subject) != (kind, trigger[kind]):

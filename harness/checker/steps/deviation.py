@@ -12,10 +12,12 @@ NameOf = Callable[[str], str]
 """A function that returns the name of the block with a given hash."""
 
 CHOOSES = 15
-"""The number of the Algorithm that records its choice instead of counters."""
+"""The number of the Algorithm whose trace line contains the chosen block. All others record the counted votes or
+answers.
+"""
 SHOWN = 3
-"""Maximum number of changes or messages that the description of a step lists. For more changes or messages, the
-description gives only their number.
+"""Maximum number of changes or messages that the description of a step lists. The description counts all further
+ones.
 """
 
 
@@ -28,7 +30,7 @@ class StepDeviation:
     t: float
     handler: str | None
     what: str = ""
-    """Description of the difference if there are no two handler runs to compare."""
+    """Description of the difference. Empty if `run` and `expected` describe it."""
     run: HandlerRun | None = None
     """The recorded handler run."""
     expected: HandlerRun | None = None

@@ -1,10 +1,10 @@
-"""Describe the end of a record that stops without a regular end of the agent. An agent that dies writes no line for its
-last handler.
+"""Describe the end of a trace that stops although the agent did not end regularly. An agent that dies in a handler
+writes no line for this handler.
 
 If `run.json` exists, it contains the reason. A crash in a handler is a deviation, because no Algorithm ends in an
 error. For records from the field, only other agents' records can show that the mission continued after the last line.
-They do not show whether the agent died in a handler or lost its power, so the sentence names the next input and both
-possibilities.
+They do not show whether the agent died in a handler or lost its power. The sentence therefore names the next input and
+both possibilities.
 """
 
 import math
@@ -20,7 +20,7 @@ from harness.checker.steps.deviation import StepDeviation
 from harness.checker.steps.follower import StepComparer
 
 FAILED = ("crashed", "hung", "broken")
-"""The outcomes in run.json of agents that ended without a request."""
+"""Outcomes in run.json of agents that failed before the harness ended them."""
 _NAMED = re.compile(r"Algorithm \d+, (\w+)")
 _OF_MESSAGE = {message.NAME: handler for message, handler in ON_MESSAGE.items()}
 
@@ -61,8 +61,9 @@ def failure(recorded: AgentRecord | None) -> str | None:
 
 
 def last_line(trace: Trace, incarnations: int | None = None) -> tuple[int, float]:
-    """Return the line number and the mission second of the last handler run. The header is line 1. `incarnations`
-    limits the number of incarnations to consider.
+    """Return the line number and the mission second of the last handler run. The header is line 1. If `incarnations` is
+    given, only this number of incarnations from the start of the trace counts. An incarnation is the time between two
+    restarts.
     """
     line, t = 1, 0.0
     for incarnation in islice(trace.incarnations(), incarnations):
@@ -73,10 +74,11 @@ def last_line(trace: Trace, incarnations: int | None = None) -> tuple[int, float
 def unfinished(
     follower: StepComparer, trace: Trace, others_until_s: float, arrivals: Iterator[MessageArrival] | None
 ) -> str | None:
-    """Return a sentence if the trace ends before the mission ended and the agent left no export. Return None otherwise.
+    """Return a sentence if the trace ends before the mission ended. Return None otherwise.
 
-    Other agents certainly continued until mission second `others_until_s`. `arrivals` contains the messages to the
-    agent, or is None if messages prove nothing.
+    Call this function only for an agent that left no export. Other agents certainly continued until mission second
+    `others_until_s`. `arrivals` contains the messages to the agent. It is None if it is unknown whether messages
+    reached the agent.
     """
     line, t = last_line(trace)
     if others_until_s <= t:

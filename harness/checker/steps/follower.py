@@ -1,7 +1,7 @@
 """Give each recorded input of an agent to the reference implementation, and compare the results.
 
-A `StepComparer` holds a reference agent in the state of the judged agent. After a difference it adopts the recorded
-state of the judged agent, so that one mistake does not cause further differences.
+A `StepComparer` holds a reference agent in the same state as the judged agent. After a difference it replaces the state
+of the reference by the recorded state of the judged agent, so that one mistake does not cause further differences.
 """
 
 import math
@@ -30,7 +30,9 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
-"""Branches in which a handler starts, changes or uses a tally. After other branches the tally is not compared."""
+"""Branches (results of a handler) after which the votes or answers that the agent has counted are compared. Other
+handler runs do not use these counts.
+"""
 
 LOGS = ON_LOCAL_EVENT["Build Data Block"].name
 """Name of the handler of Algorithm 1, which only logged events trigger."""
@@ -38,8 +40,8 @@ PAUSES = "receive_response_block_for_hash"
 """Name of the handler that pauses and continues the phase 3 timer. No record shows this pause."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Message handlers that change a timer. For all other message handlers, the recorded changes are sufficient to undo the
-effects.
+"""Message handlers that change a timer. The effects of all other message handlers can be undone with the recorded
+changes alone.
 """
 
 Delayed = Callable[[float, float], bool]
@@ -49,8 +51,8 @@ machine was busy.
 
 
 class NotHandledError(Exception):
-    """An error: the protocol does not run this handler at this moment. The message completes a sentence that begins
-    with "it".
+    """An error: the protocol does not run this handler at this moment. The message has no subject. The caller puts "it"
+    before it.
     """
 
 
@@ -67,8 +69,8 @@ class RecordedTimerExpiry(NamedTuple):
 
 
 class OptionalTraceFields(NamedTuple):
-    """The optional fields that this trace contains. `tallying` names the handlers whose runs record a tally. `timers`
-    is true if the trace records timers.
+    """The optional fields that this trace contains. `tallying` contains the names of the handlers whose trace lines
+    list counted votes or answers. `timers` is true if trace lines list the started timers.
     """
 
     tallying: frozenset[str]
@@ -104,9 +106,11 @@ class StepComparer:
         self.deviations: list[StepDeviation] = []
         """The differences found so far, in order."""
         self.expiries: list[RecordedTimerExpiry] = []
-        """The timer expiries that occurred in the reference and that the agent handled, in order."""
+        """The timer expiries of the reference that the agent handled too, in order."""
         self.lost: str | None = None
-        """The reason why the comparison cannot continue, with its trace line. None while it can continue."""
+        """The reason why the comparison cannot continue, with the number of the trace line. None as long as it can
+        continue.
+        """
         self.stops_before_handler = False
         """True to stop in the debugger before each handler."""
         self._header = header
@@ -118,19 +122,19 @@ class StepComparer:
         self._core = implementation.core(header)
         self._timers = {timer.name: timer for timer in self._core.timers}
         self._ran: dict[str, tuple[int, float]] = {}
-        """Handler -> number of the trace line, and mission second, of its run since the last input."""
+        """Handlers that ran since the last input. Handler -> number of the trace line, and mission second."""
         self._adopted = False
-        """True if a difference was found since the last input. The handlers that were triggered since then are not
-        compared.
+        """True if a difference was found since the last input. The local events since then may be consequences of the
+        difference, so they are not compared.
         """
         self._began = False
         self._none_ends_before = math.inf
-        """Time of the next timer expiry of the reference, on the agent's clock."""
+        """Time on the agent's clock before which no timer of the reference expires."""
         self._paused = 0, -math.inf
         """The last pause of the phase 3 timer: the number of the trace line, and the time on the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """The last recorded state, as long as the reference is still in this state."""
+        """The last compared state of the agent, if the reference has not changed since. It saves a comparison."""
 
     def follow(self, line: int, run: HandlerRun) -> None:
         """Compare this handler run with the reference. Also check that the agent omitted no earlier handler run."""
@@ -216,8 +220,8 @@ class StepComparer:
     # Lines that may be lost
 
     def has_effect(self, sender: int, message: Message, at_s: float) -> bool:
-        """Give the reference a message that is missing in the trace. Return true if the message has an effect: a
-        change, a counted answer, a message, a timer or a local event.
+        """Let the reference handle a message that the trace lacks. Return true if the message has an effect: a change
+        of blocks, a counted answer, a sent message, a started timer or a local event.
         """
         core = self._core
         core.now = self._header.local(at_s)
@@ -226,14 +230,14 @@ class StepComparer:
         return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Give the reference a message that has no line in the trace. Return true if the loss of this line would be
-        invisible, because the message changed no block.
+        """Let the reference handle a message that the trace lacks. Return true if the message changed no block, because
+        a trace can then lack its line without a contradiction.
         """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
-        """Let a timer of the reference expire although the trace has no line for the expiry. Return true if the timer
-        was due, and if the loss of this line would be invisible.
+        """Let a timer of the reference expire, although the trace has no line for the expiry. Return true if the timer
+        was due and its handler changed no block, because a trace can then lack this line without a contradiction.
         """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
@@ -242,8 +246,8 @@ class StepComparer:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next local event. Return true if a local event waited, and if the loss of its trace
-        line would be invisible.
+        """Run the handler of the next local event. Return true if an event waited and its handler changed no block,
+        because a trace can then lack this line without a contradiction.
         """
         if not self._core.triggered:
             return False
@@ -284,8 +288,8 @@ class StepComparer:
         return twin
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Find the triggered handlers that are missing or additional before the next handler run, and return them as
-        deviations. The method runs no handler.
+        """Return a deviation for each local event whose handler is missing before the given handler run, or that has an
+        additional handler run. This object does not change, and no handler runs.
         """
         foreseeing = self.copy()
         if foreseeing.lost is None:
@@ -304,7 +308,9 @@ class StepComparer:
     # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Report triggered handlers that did not run, and handlers that ran without a trigger."""
+        """Report handlers that a local event should have triggered but that did not run, and handlers that ran without
+        their event.
+        """
         self._state = None
         triggered = self._core.triggered
         if self._adopted:
@@ -381,8 +387,8 @@ class StepComparer:
         return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Return a phrase with the handler that paused the phase 3 timer after its start, for the end of a sentence.
-        The phrase is empty without a pause.
+        """Return a phrase for the end of a sentence if a handler paused the phase 3 timer after its start. Return an
+        empty text otherwise.
         """
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:
@@ -400,8 +406,8 @@ class StepComparer:
     # Inputs
 
     def _input(self, line: int, run: HandlerRun, now: float) -> tuple[Handler, tuple[Any, ...]]:
-        """Return the handler for an input that is not a message, with the handler's arguments. Raises NotHandledError
-        if no handler matches.
+        """Return the handler for an input and the arguments of the handler. The input is an event, an expired timer, a
+        local event, a restart or a command, but no message. Raises NotHandledError if no handler matches.
         """
         trigger, on_local_event = run.trigger, self._implementation.on_local_event
         handler: Handler

@@ -1,4 +1,6 @@
-"""An implementation of the 20 handlers that can be compared with records: an agent core and its tables of handlers."""
+"""An implementation of the 20 handlers, in a form that can be compared with records: an agent core and its tables of
+handlers.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -14,8 +16,8 @@ class ReferenceCore(AdoptingCore, ReferenceState):
 
 
 class CoreImplementation(NamedTuple):
-    """An agent core and its handlers. The tables of handlers are indexed by message type, by timer, by local event and
-    by handler name.
+    """An agent core and its handlers. The tables find a handler by message type, by timer, by local event or by its
+    name.
     """
 
     core: Callable[[CheckedHeader], AdoptingCore]

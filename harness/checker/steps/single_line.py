@@ -44,14 +44,16 @@ Line = tuple[int, HandlerRun]
 
 
 class OtherRecords(Protocol):
-    """The records of a flight: those of all other agents, and some facts about the judged agent and its trace file."""
+    """The records of a flight that help to judge a damaged trace: those of all other agents, and some facts about the
+    judged agent and its trace file.
+    """
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]:
         """Return the recorded datagrams with this sender and this sequence number."""
 
     def sent_by_others(self, kind: str) -> Iterable[tuple[int, Message]]:
-        """Return the recorded messages of this type from other agents, with their senders. Equal messages
-        occur once.
+        """Return each different message of this type that other agents sent according to their records, with its
+        sender.
         """
 
     def may_have_arrived(self, sender: int, message: Message, at_s: float) -> bool:
@@ -60,26 +62,28 @@ class OtherRecords(Protocol):
         """
 
     def was_reconciling(self, at_s: float) -> bool:
-        """Return true if the last trace line of the judged agent before this mission second shows a reconcile."""
+        """Return true if the agent was reconciling at its last trace line before this mission second."""
 
     def beginnings(self, number: int) -> Iterable[str]:
-        """Return each part of line `number` of the trace file that ends at the beginning of a disk block."""
+        """Return the beginnings of line `number` of the trace file that end where a disk block begins. A line inside
+        one disk block has no such beginning.
+        """
 
 
 LINES_AFTER = 8
-"""Number of lines after the difference that must agree with an explanation."""
+"""Number of trace lines after the difference that must agree with the reference after the correction."""
 JOINED = "a part of the file is missing, and the line is joined from two lines"
-"""The phrase for a line that consists of the beginning of one line and the end of a later line."""
+"""The phrase for the damage to a line that consists of the beginning of one line and the end of a later line."""
 MAX_FURTHER = 2
-"""Maximum number of further lost lines among these lines."""
+"""Maximum number of lines that may be missing among these lines."""
 MAX_ANSWERS = 4
-"""Maximum number of lost answers to one question."""
+"""Maximum number of consecutive lost lines with answers to one question."""
 COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
 """Names of the handlers that count answers."""
 _MESSAGES = {handler.name: kind.NAME for kind, handler in ON_MESSAGE.items()}
 """Name of a handler of messages -> the type of its messages."""
 MAX_LOCAL = 4
-"""Maximum number of handlers that one lost handler run may have triggered, one after another."""
+"""Maximum number of consecutive lost lines that local events triggered."""
 
 
 def damage_that_explains(
@@ -117,8 +121,9 @@ def damage_that_explains(
 def _agrees(
     follower: StepComparer, lines: Sequence[Line], others: OtherRecords | None = None, lost: int = MAX_FURTHER
 ) -> bool:
-    """Return true if the reference agrees with the lines. Lines after the first block with different events do not
-    count. If `others` is given, up to `lost` further lines may be missing between the lines.
+    """Return true if the reference agrees with the lines. A block whose recorded events differ from the logged events
+    ends the comparison, because another lost line may be the cause. If `others` is given, up to `lost` further lines
+    may be missing between the lines.
     """
     start = None if others is None or not lost else follower.copy()
     for place, (number, run) in enumerate(lines):
@@ -182,9 +187,8 @@ def _as_it_may_have_been(
 
 
 def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, others: OtherRecords) -> bool:
-    """Return true if another agent received a message that this line contains and that the reference does not send.
-
-    The line is then correct about this message.
+    """Return true if another agent received a message on this line that the reference does not send. The line is then
+    no damaged copy of the expected line.
     """
     sent_by_both = [sent.datagram for sent in expected.sent]
     return any(
@@ -200,11 +204,11 @@ def _differ_in_one_character(text: str, other: str) -> bool:
 
 
 def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line]) -> bool:
-    """Return true if only the top chain hash differs from the expected state, and the next lines agree with the
-    expected hash.
+    """Return true if the recorded state differs from the expected state only in the top chain hash, and the next lines
+    agree with the expected hash.
 
-    Damage can join the beginning of a line with the end of a later line. Such a line can therefore also be the last one
-    before lost lines.
+    Such a line may also be the last one before lost lines, because damage can join the beginning of a line with the end
+    of a later line.
     """
     number, run = line
     expected = deviation.expected
@@ -218,10 +222,10 @@ def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Li
 
 
 def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) -> bool:
-    """Return true if the handler on the line has another number or another trigger, or if a datagram on the line is
-    invalid or is not the message that the line names.
+    """Return true if parts of the line contradict each other: the name of the handler, its number and its trigger, or a
+    datagram and the name of its message. An invalid datagram is also a contradiction.
 
-    If another agent received an invalid datagram, the agent has sent it, and the line is correct.
+    If another agent received the invalid datagram, the agent really sent it, so the line is correct.
     """
     if _names_another_handler(run):
         return True
@@ -239,11 +243,11 @@ def _contradicts_itself(run: HandlerRun, agent_id: int, others: OtherRecords) ->
 
 
 def _is_joined(deviation: StepDeviation, line: Line, others: OtherRecords) -> bool:
-    """Return true if the line is as expected up to the beginning of a disk block, or if its branch is unknown and the
-    line contains the beginning of a disk block.
+    """Return true if the line may consist of the beginning of one line and the end of a later line.
 
-    The rest of the line then may be the end of a later line. Only few lines contain the beginning of a disk block, so
-    this damage cannot explain repeated mistakes of an agent.
+    A lost disk block joins two lines in this way, so the join must be at the beginning of a disk block. The line must
+    be as expected before the join, or its branch must be unknown. Only few lines contain the beginning of a disk block,
+    so this damage cannot explain repeated mistakes of an agent.
     """
     number, run = line
     if deviation.expected is None or deviation.run is not run:
@@ -254,7 +258,7 @@ def _is_joined(deviation: StepDeviation, line: Line, others: OtherRecords) -> bo
 
 
 def _with_recorded_input(expected: HandlerRun, run: HandlerRun) -> HandlerRun:
-    """Return the expected handler run with the input of the recorded one, which the reference does not compute."""
+    """Return the expected handler run with the recorded input. The reference does not compute inputs."""
     other = copy(expected)
     other.input, other.sealed, other.started = run.input, run.sealed, other.started or None
     return other
@@ -302,8 +306,8 @@ def _was_received_as(sent: SentMessage, agent_id: int, others: OtherRecords) -> 
 
 
 def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
-    """Return the damage to a trace line that explains why the events of a completed block differ from the events that
-    the agent logged. Return None if no damage explains the difference.
+    """Return a phrase for the damage if the agent completed a block whose events differ from the logged events, and a
+    damaged or lost line explains the difference. Return None otherwise.
     """
     completed = next((block_hash for operation, block_hash in run.changes if operation == "complete"), None)
     if run.handler != LOGS or completed is None:
@@ -325,8 +329,8 @@ def _damage_to_events(before: StepComparer, run: HandlerRun) -> str | None:
 
 
 def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run: HandlerRun) -> bool:
-    """Return true if the agent completed another block than its recorded events result in, and if no record contains
-    this block.
+    """Return true if the agent completed a different block than the reference, and no record contains this block. An
+    event whose line is lost may then be in the block.
     """
     if deviation.run is not run or deviation.expected is None or run.handler != LOGS or not run.changes:
         return False
@@ -338,8 +342,8 @@ def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each copy is in a state that the agent could have if one line of the trace were
-    lost.
+    """Yield copies of the reference, each after one additional handler run. Each one is a guess at the handler run on a
+    lost line.
     """
     yield from _with_local_events_more(before, run)
     yield from _with_an_expiry_more(before, run, others)
@@ -357,7 +361,7 @@ def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecord
 
 
 def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each copy has run the handlers of some of the next local events."""
+    """Yield copies of the reference after one, two or more of the waiting local events, up to `MAX_LOCAL`."""
     trial = before.copy()
     for _ in range(MAX_LOCAL):
         if not trial.play_lost_local_event(run.t):
@@ -366,9 +370,10 @@ def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[S
 
 
 def _with_an_expiry_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference after the expiry of a timer, and after the local events that follow.
+    """Yield copies of the reference after the expiry of a timer, and after the local events that this triggers.
 
-    During a reconcile, Algorithm 5 does nothing. The loss of its line therefore shows only after the reconcile.
+    Algorithm 5, Vote Timer Expiration, does nothing during a reconcile. If its line is lost then, the loss shows only
+    after the reconcile. The function therefore also yields a copy in which the voting timer is stopped.
     """
     voting = before.state.voting_timer
     due_s = None if voting.deadline is None else before.mission_s(voting.deadline)
@@ -386,8 +391,8 @@ def _with_an_expiry_more(before: StepComparer, run: HandlerRun, others: OtherRec
 def _with_lines_more(
     before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords
 ) -> Iterator[StepComparer]:
-    """Yield copies of the reference. Each copy has received answers to its last question whose trace lines are lost.
-    The line of the expiry that ended the question can be lost as well.
+    """Yield copies of the reference after answers to its last question whose trace lines are lost. In some copies, the
+    timer of the question has also expired, because the line of this expiry can be lost as well.
     """
     for count in range(1, MAX_ANSWERS + 1):
         for trial in _with_answers_more(before, following, others, count):
@@ -399,8 +404,8 @@ def _with_lines_more(
 def _with_answers_more(
     before: StepComparer, following: Sequence[HandlerRun], others: OtherRecords, count: int
 ) -> Iterator[StepComparer]:
-    """Yield copies of the reference that have received `count` answers without a trace line. An agent counts only one
-    answer of each sender. The sender of a lost answer is therefore not the sender of a recorded answer.
+    """Yield copies of the reference after `count` answers whose trace lines are lost. An agent counts only one answer
+    of each sender. The senders of lost answers are therefore other agents than the senders of recorded answers.
     """
     run, state = following[0], before.state
     answered = state.voters if state.voting_timer.active else state.reconcile_responders
@@ -419,8 +424,8 @@ def _with_answers_more(
 
 
 def _senders(runs: Iterable[HandlerRun]) -> set[int]:
-    """Return the senders of the answers that an agent received before it ended its question or asked another
-    question.
+    """Return the senders of the recorded answers to the current question. The first handler run without a message ends
+    the search, because the question then has ended.
     """
     senders = set()
     for run in runs:
@@ -432,7 +437,7 @@ def _senders(runs: Iterable[HandlerRun]) -> set[int]:
 
 
 def _assignments(choices: Sequence[Sequence[int]]) -> Iterator[tuple[int, ...]]:
-    """Yield tuples with one element of each sequence, in which no element occurs twice."""
+    """Yield all tuples that contain one element of each sequence, without a repeated element."""
     if not choices:
         yield ()
         return
@@ -441,7 +446,7 @@ def _assignments(choices: Sequence[Sequence[int]]) -> Iterator[tuple[int, ...]]:
 
 
 def _answers(state: ReferenceState, run: HandlerRun, others: OtherRecords) -> Iterator[Message]:
-    """Yield the possible answers to the query or request that the agent has sent last."""
+    """Yield the possible answers to the agent's last query or request."""
     top = state.chain.top_chain_hash
     if state.voting_timer.active and state.candidate_block is not None:
         named = state.top_chain_hash_at_initiation if state.settings.vote_names_chain else None

@@ -12,7 +12,9 @@ from harness.checker.reference.state import Settings
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 
 EARLY_WALL_S = 0.001
-"""Seconds of wall time by which a timer may expire early, because an agent reads its clock more than once."""
+"""Seconds of wall time by which a timer may expire early. An agent may read its clock when it starts a timer, and again
+for the trace line.
+"""
 ROUNDING_S = 2e-3
 """Rounding error in seconds of times in a trace, which may be rounded to milliseconds."""
 
@@ -30,7 +32,7 @@ class UnknownSettingError(ImpossibleHeaderError):
 
 @dataclass(frozen=True)
 class CheckedHeader:
-    """The mission that a trace header describes."""
+    """The facts about a mission and an agent's clock that the agent wrote into the header of its trace."""
 
     agent_id: int
     roster: frozenset[int]
@@ -81,8 +83,8 @@ def checked(header: TraceHeader) -> CheckedHeader:
 
 
 def _settings(header: TraceHeader) -> Settings:
-    """Return the settings in the header. A missing setting has the default of the reference, because the defaults of an
-    edited core may be wrong.
+    """Return the settings in the header. For a missing setting, the reference's own default applies. The default of the
+    agent core is not used, because an edited core may have a wrong default.
     """
     known = {setting.name: setting.default for setting in fields(Settings)}
     if unknown := sorted(str(name)[:40] for name in header.settings.keys() - known.keys()):
