@@ -18,7 +18,9 @@ from pathlib import Path
 
 NAME = "UCP_HARNESS_AGENT"
 GRACE_S = 0.5
-"""Seconds of wall time that a child process has to end after its agent."""
+"""Seconds of wall time for which the harness waits after the end of an agent, so that the agent's child processes can
+end by themselves.
+"""
 RETRY_S = 0.02
 MAX_ROUNDS = 20
 """Maximum number of rounds in which the harness ends child processes. Several rounds are needed if a child process

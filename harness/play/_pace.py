@@ -8,10 +8,10 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 
 TICK_S = 0.05
-"""Seconds of wall time between two checks of the clock."""
+"""Maximum seconds of wall time that paused or limited virtual time waits before it checks the clock again."""
 CATCH_UP_S = 1.0
-"""If a simulation is late by at most this number of seconds (wall time), it runs faster until it is on time again. If
-it is later, it continues at the requested speed.
+"""Maximum delay in seconds of wall time that a simulation catches up by running faster. After a greater delay, it
+continues at the requested speed and stays late.
 """
 NEXT_RUN = math.inf
 """A special value for the end of a single step. With this value, the step ends with the next handler run of any agent.
@@ -34,8 +34,8 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """The wall time and the mission second from which later times are computed with the current speed, or None if
-        the next check must set them.
+        """A wall time and the mission second that belongs to it. Later mission seconds follow from this pair and the
+        current speed. None if the next check must set the pair.
         """
         self._pace_changed = asyncio.Event()
 
@@ -60,7 +60,7 @@ class VirtualTimePace:
 
     def step(self, to_s: float, done: "Future[float]") -> None:
         """Advance virtual time to mission second `to_s`, and then pause. With `NEXT_RUN`, advance to the next handler
-        run. `done` is a future in the state "running", which receives the mission second at the end of the step.
+        run. The future `done` receives the mission second at the end of the step. It must be in the state "running".
         """
         self.paused = True
         self._change()

@@ -40,8 +40,8 @@ class MissionKeys:
         return next(iter(self.bundles.values())).public
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
-        """Return the data of the inception block. If event data are encrypted, append the public key of the depot to
-        the data.
+        """Return the data of the inception block, the first block of each chain. If event data are encrypted, append
+        the public key for the encryption. The depot, which collects the records after the flight, has the private key.
         """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 
@@ -150,8 +150,8 @@ class KeyDirectories:
         self.directories = {agent_id: directory / str(agent_id) for agent_id in (keys.bundles if keys else ())}
 
     def write_bundle(self, agent_id: int, *, kept: bool) -> Path | None:
-        """Write the file with the vehicle's keys, and return its path. If `kept` is true, an existing file stays
-        unchanged. Raises OSError.
+        """Write the file with the vehicle's keys, and return its path. Return None without keys. If `kept` is true, the
+        vehicle kept its disk, so an existing file stays unchanged. Raises OSError.
         """
         if self.keys is None:
             return None

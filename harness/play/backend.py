@@ -23,8 +23,8 @@ class Backend(ABC):
 
     name: ClassVar[BackendName]
     virtual_time: ClassVar[bool] = False
-    """True if the backend computes mission time. A run with computed mission time has no lag, no speedup and no
-    telemetry.
+    """True if the backend computes mission time in a simulation. Such a run has no speedup, no telemetry, and no delays
+    by a slow machine.
     """
     plays_in_memory: ClassVar[bool] = False
     """True if `harness.run.simulate` can carry out the same run in memory, which makes runs of many seeds fast."""

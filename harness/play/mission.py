@@ -120,8 +120,9 @@ class Swarm(Protocol):
     async def until_run(self, sought: SoughtRun, mission_s: float) -> int | None:
         """Wait until an agent runs this handler, but at most until `mission_s`.
 
-        Return the ID of the agent. Return None if no agent ran the handler. A handler run that the last change of the
-        timeline caused also ends the wait. With processes, so does any handler run since the last call of `until`.
+        Return the ID of the agent. Return None if no agent ran the handler. The wait also ends at once if the last
+        change of the timeline has already caused such a handler run. With processes, each handler run since the last
+        call of `until` counts, too.
         """
 
     async def apply(self, change: Change) -> None:

@@ -21,16 +21,16 @@ from harness.scenario import Scenario
 MEGABYTE = 1_000_000
 SHARE_OF_FREE_SPACE = 0.5
 LEAST_BYTES_PER_AGENT = 8 * MEGABYTE
-"""Minimum quota of an agent's files in bytes. The quota also includes the export and the store, which are much smaller
-than the trace.
+"""Minimum space for the files of an agent, in bytes. Besides the trace, these are the export and the stored state,
+which are much smaller.
 """
 MEAN_S = 30.0
 MESSAGES_PER_MINUTE = ((2, 4), (5, 38), (10, 229), (15, 885), (20, 2010), (30, 6050), (50, 25_500), (100, 90_700))
 """Messages per minute for some numbers of agents, if each agent logs an event every 30 s (docs/appendix/growth.md)."""
 BYTES_PER_LINE = 800
 LINES_WITHOUT_IDLE_RECEIPTS = 2
-"""Number of trace lines for each message in virtual time. Virtual time delivers only messages that can affect their
-receivers.
+"""Average number of trace lines per message in virtual time. It is small, because virtual time delivers a message only
+to agents that it can affect.
 """
 
 

@@ -44,8 +44,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """The new handler of a variant for one algorithm of the agents. The fields after `run` are additions to the
-    declarations of the original handler.
+    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list what the new
+    handler does in addition to the original one, such as further messages that it sends.
     """
 
     algorithm: int
@@ -166,7 +166,7 @@ def variant_in_use() -> Variant | None:
 
 
 class NumberedHandler(Protocol):
-    """A handler with the number of its algorithm."""
+    """Any handler that has the number of its algorithm."""
 
     @property
     def algorithm(self) -> int: ...
@@ -174,8 +174,8 @@ class NumberedHandler(Protocol):
 
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
-    """Replace the handlers of these algorithms in all tables inside the context. Each function in `new` receives the
-    original handler and returns its replacement.
+    """Replace the handlers of these algorithms in all tables inside the context, and restore them at the end. Each
+    function in `new` receives the original handler and returns its replacement.
     """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}

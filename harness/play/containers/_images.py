@@ -1,4 +1,4 @@
-"""Build or choose the Docker images of vehicles and agents.
+"""Build or choose the Docker images of vehicles and agents. Three kinds of images exist:
 
 project     built from the Dockerfile beside this file, with the installed packages `ucp` and `sitl`
 named       an image that the scenario names
@@ -177,8 +177,8 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the directory of the program's virtual environment. If the program does not belong to a virtual
-    environment, return the program.
+    """Return the path that a container must share to run the program: the virtual environment of the program, or the
+    program itself if it belongs to none.
     """
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program

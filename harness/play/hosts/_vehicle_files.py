@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 FILE_HEADER = struct.Struct("!H")
-"""Length of the name of a file, which precedes the name and a part of the file's content."""
+"""The format of the length of a file name, in bytes. In a message, the length comes first, then the name, then a part
+of the file.
+"""
 
 
 def file_names(directory: Path) -> Iterator[str]:

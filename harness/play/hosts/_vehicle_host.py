@@ -45,20 +45,26 @@ MAX_ANSWER_BYTES = 1024
 READ_BYTES = 1 << 16
 FILE_BYTES = 1 << 18
 MAX_UNSENT_BYTES = 1 << 20
-"""Number of bytes that wait for the lab, beyond which this program reads nothing more from vehicles and files."""
+"""Number of bytes waiting to be sent to the lab. Above this number, the program reads no further output of vehicles and
+no further files.
+"""
 MAX_WAITING_BYTES = 1 << 16
-"""Number of bytes that wait for a slow vehicle, beyond which further data for it is dropped."""
+"""Number of bytes waiting to be sent to a slow vehicle. Above this number, further data for this vehicle are
+dropped.
+"""
 DRAIN_S = 0.02
 OUTPUT = "output.log"
 
 
 class _Program:
-    """The program of one vehicle, and the process that keeps it."""
+    """The program of one vehicle, and its keeper: the first process in the vehicle's network, which starts the
+    program.
+    """
 
     def __init__(self, number: int, directory: Path, keeper: socket.socket, process: ForkedProcess) -> None:
         self.number, self.directory, self.keeper, self.process = number, directory, keeper, process
         self.given: frozenset[str] = frozenset()
-        """The names of the files that the lab sent."""
+        """The names of the files that the lab sent. They need not be sent back at the end."""
         self.output = FileTail(directory / OUTPUT)
         self._answers: deque[asyncio.Future[tuple[int | None, int | None]]] = deque()
 

@@ -34,9 +34,10 @@ READ_BYTES = 1 << 16
 
 
 class FarVehicle(RunningProgram):
-    """A vehicle program on a worker. When it has ended, the worker ends the processes that it left behind.
+    """A vehicle program that runs on a worker. When the program has ended, the worker also ends its child processes.
 
-    Its files have arrived when `wait` returns. If the worker is lost, the return code is -SIGKILL.
+    The method `wait` returns after the files of the program have arrived. If the worker is lost, the return code is
+    -SIGKILL.
     """
 
     def __init__(self, number: int, worker: WorkerConnection, output: Path) -> None:
@@ -45,7 +46,7 @@ class FarVehicle(RunningProgram):
         self.number, self.output = number, output
         self._worker = worker
         self.started: asyncio.Future[str | None] = loop.create_future()
-        """The reason why the program could not be started, or None."""
+        """A future. Its result is None when the program has started, or the reason why it could not be started."""
         self.killed = False
 
     async def send_signal(self, number: int) -> None:

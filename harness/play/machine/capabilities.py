@@ -99,9 +99,7 @@ def _ardupilot() -> MachineRequirement:
 
 
 _SHOWN = {"": (100.0, "%"), "s": (1000.0, "ms"), "bit/s": (0.001, "kbit/s"), "packets": (1.0, "packets")}
-"""The unit that is printed in place of each unit in `netem.measure`. The values are the conversion factor and the name
-of the printed unit.
-"""
+"""Unit of a measured value -> the factor and the unit for display. For example, 0.02 s is displayed as 20 ms."""
 
 
 def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[str], None]) -> list[EngineMeasurement]:
@@ -117,7 +115,7 @@ def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[s
 
 
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """Return an observer of measurements. The observer also reports which measurement is in progress."""
+    """Return an observer that calls `observe`, and that first reports the measurement that is about to begin."""
 
     def observe_and_report(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)

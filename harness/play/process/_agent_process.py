@@ -72,7 +72,7 @@ class _ProcessIncarnation:
     status: AgentStatus | None = None
     """The last status that the agent reported."""
     status_between_s: tuple[float, float] = (0.0, 0.0)
-    """The earliest and the latest mission second at which the agent can have read the counters in `status`."""
+    """Two mission seconds. The agent read the counters in `status` between them."""
     killed: bool = False
     """True if the incarnation ended by SIGKILL and its disk was not kept."""
     switched_off: bool = False
@@ -82,7 +82,7 @@ class _ProcessIncarnation:
     reboot: bool = False
     """True if the incarnation started with the data on the agent's disk."""
     completed_known: bool = False
-    """True if the trace has shown which blocks this killed incarnation completed."""
+    """True if the harness has read from the trace which blocks this killed incarnation completed."""
     trace_bytes_copied: int = 0
     """Number of bytes of this incarnation's trace that were already appended to the complete trace of the agent."""
 
@@ -109,9 +109,12 @@ class AgentProcess:
         controlled: Callable[[LabProgram], LabProgram] | None = None,
         loss: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Create the object without starting the process. `command` starts the agent with its mission file as last
-        argument. `now` returns mission seconds. For a remote agent, `command` starts its stand-in, and `controlled`
-        returns the program to control in place of the stand-in. `loss` returns a phrase if its computer is lost.
+        """Create the object without starting the process. `command` starts the agent. The harness appends the mission
+        file to it. `now` returns mission seconds.
+
+        A remote agent runs on another computer. For such an agent, `command` starts a stand-in on this machine.
+        `controlled` then returns the program to control in place of the stand-in, and `loss` returns a phrase if the
+        other computer is lost.
         """
         self.agent_id = agent_id
         self._command = command

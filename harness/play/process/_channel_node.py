@@ -47,7 +47,9 @@ from ucp.messages import (
 
 CONTROL = "channel.control"
 VALUE = "channel.value"
-"""Name of the file that holds a large value of a command or of an answer."""
+"""Name of the file through which large values of commands and answers are passed. A line on the control socket would be
+too short.
+"""
 
 NANOSECONDS = 1e9
 KEPT_QUESTIONS = 10_000
@@ -62,7 +64,7 @@ ANSWER_TO = {
         (RequestForBlock, BlockResponse),
     )
 }
-"""The type code of the answers to each query or request, by the type code of the query or request."""
+"""Type code of a query or request -> type code of the answers to it."""
 
 
 class ChannelNode:
@@ -251,10 +253,10 @@ class AnswerTimeMeter:
     def __init__(self) -> None:
         self._all = array("f")
         self._question: dict[bytes, int] = {}
-        """The type code of the answers to a query, by the frame of the query. Only the latest queries are kept."""
+        """Frame of a query -> type code of the answers to it. Only the latest queries are kept."""
         self._asked_s: dict[tuple[int, int], float] = {}
-        """The time at which a vehicle received its latest query that asks for a certain answer. The key is a pair: the
-        vehicle, and the type code of the answer.
+        """Vehicle and type code of an answer -> mission second at which the vehicle received the latest query that
+        needs such an answer.
         """
 
     def sent(self, heard: ReceivedBroadcast, data: bytes, at_s: float) -> None:

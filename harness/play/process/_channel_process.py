@@ -43,7 +43,7 @@ class ChannelProcess:
         self._conditions = NetworkConditions()
         self._begun = False
         self._asking = asyncio.Lock()
-        """A lock for the file with large values, because only one command at a time may use this file."""
+        """A lock for the file that carries large values. Only one command at a time may use the file."""
 
     async def start(self, lab: Lab) -> None:
         """Start the process and wait until it listens. Raises MachineError."""

@@ -51,7 +51,7 @@ from ucp.clock import MICROSECONDS, MissionClock
 POLL_S = 0.25
 QUIET_POLL_S = 0.1
 PACK_S = 1.0
-"""Seconds of wall time between two searches for parts of traces that can be packed."""
+"""Seconds of wall time between two searches for finished parts of traces, which the harness then compresses."""
 START_DELAY_S = 0.05
 MIN_FOLLOW_S = 0.1
 """Minimum seconds of wall time between two reads of the vehicles' positions."""
@@ -487,7 +487,7 @@ class ProgramRun:
             await asyncio.sleep(POLL_S)
 
     async def _pack_traces(self) -> None:
-        """Pack finished parts of large traces, so that the run needs less disk space."""
+        """Compress finished parts of large traces, so that the run needs less disk space."""
         while True:
             await asyncio.sleep(PACK_S)
             with contextlib.suppress(OSError):  # the disk is full, and the agents record it

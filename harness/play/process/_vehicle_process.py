@@ -38,8 +38,8 @@ class VehicleFailedError(HarnessError):
 
 class VehicleProcess:
     """The program of one vehicle. `sysid` is the MAVLink system ID of the vehicle. `incarnation` is 1 for the first
-    program of the vehicle, and greater for a replacement. `lost_worker` returns the address of the worker on which the
-    program runs, if this worker is lost.
+    program of the vehicle, 2 for its first replacement, and so on. `lost_worker` returns None, or the address of the
+    computer that runs the program if the connection to it is lost.
     """
 
     def __init__(
@@ -63,7 +63,9 @@ class VehicleProcess:
         self._station_port = STATION_PORT
         self._lost_worker = lost_worker
         self._lost_with: str | None = None
-        """The worker with which the vehicle was lost."""
+        """The address of the worker (a computer of a cluster) that ran the vehicle, if the vehicle was lost because the
+        worker was lost.
+        """
 
     @property
     def _output(self) -> Path:

@@ -29,7 +29,8 @@ from ucp.features import CONTRACT
 
 SOCKET = "join"
 WORKER = 0
-"""The agent ID in the hello of a worker itself (`harness.play.hosts`). The session is then the address of the worker.
+"""The agent ID that the worker of a cluster sends when it connects for its vehicles, not for an agent
+(`harness.play.hosts`). The session is then the address of the worker.
 """
 JOIN_LIMIT_S = 300.0
 """Seconds of wall time in which all far ends must connect."""
@@ -67,15 +68,15 @@ class FarEnd:
             return False
 
     async def keep(self) -> None:
-        """Store the connection until an incarnation of its agent starts. Close an earlier connection of the same agent.
-        Raises OSError.
+        """Inform the far end that its connection stays unused until an incarnation of its agent starts. Raises
+        OSError.
         """
         loop = asyncio.get_running_loop()
         await loop.sock_sendall(self.connection, self.channel.encode(Kind.IDLE))
 
     def hand_over(self, stand_in: socket.socket, offset_s: float | None) -> None:
-        """Pass the connection to a stand-in. `offset_s` is the offset of the far clock, if this offset is already
-        known.
+        """Pass the connection to a stand-in. `offset_s` is the offset of the far clock in seconds, or None before its
+        first measurement.
         """
         with contextlib.suppress(OSError):  # the stand-in has ended
             hand_over(stand_in, self.connection, {**self.channel.to_json(), "offset_s": offset_s})
@@ -107,7 +108,9 @@ class Host(Protocol):
         """Accept a new connection of a far end. Raises HandshakeError, WireError or OSError if the connection fails."""
 
     def begin(self, number: int, stand_in: socket.socket) -> None:
-        """Accept the connection of a new stand-in. Its task contains `number`, which identifies it."""
+        """Accept the connection of a new stand-in. `number` is the number in its task, which identifies the
+        stand-in.
+        """
 
     def hear(self, number: int, stand_in: socket.socket, message: dict[str, Any]) -> None:
         """Handle a message of a stand-in. An empty message means that the stand-in has ended."""

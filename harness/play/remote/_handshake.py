@@ -36,8 +36,8 @@ _TAG_BYTES = 32
 
 
 class HandshakeError(Exception):
-    """An error: the other end of a connection has another secret or protocol. The message is one sentence without a
-    subject.
+    """An error: the other end of a connection has another secret or protocol. The message has no subject, because the
+    caller puts the name of the other end before it.
     """
 
 

@@ -39,7 +39,7 @@ class _RemoteVehicle:
     command: list[str] = field(default_factory=list)
     session: str = ""
     held: FarEnd | None = None
-    """The connection of a far end that no stand-in uses yet."""
+    """A connection to the other computer that is ready for the next incarnation of the agent. None if there is none."""
     stand_in: socket.socket | None = None
     offset_s: float | None = None
     epoch_us: int | None = None
@@ -53,12 +53,12 @@ class _RemoteVehicle:
     left_behind: tuple[str, ...] = ()
     """Names of the processes that the last incarnation of the agent left running."""
     is_connected: bool = False
-    """True if a far end plays the current incarnation."""
+    """True if another computer is connected and runs the current incarnation."""
     incarnations: int = 0
     is_complete: bool = False
-    """True if the end of the current incarnation is on record."""
+    """True if the records of the current incarnation are complete up to its end."""
     incomplete: list[int] = field(default_factory=list)
-    """Numbers of the incarnations whose end is not on record."""
+    """Numbers of the incarnations whose records lack the end."""
     joins: int = 0
     joined: asyncio.Event = field(default_factory=asyncio.Event)
 

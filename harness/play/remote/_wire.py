@@ -186,7 +186,9 @@ def _nonce(number: int) -> bytes:
 ADDRESS_BYTES = 4
 """Number of bytes of the sender's address, which precedes a datagram to the agent."""
 NUMBER_BYTES = 4
-"""Number of bytes of the request number, which precedes each request and each answer."""
+"""Number of bytes of the request number. It precedes each request and its answer, so that answers can be assigned to
+requests.
+"""
 SILENT_S = 2.0
 """Seconds of wall time without a ping or pong after which a vehicle counts as cut off."""
 LOST_AFTER_S = 10.0
@@ -207,7 +209,9 @@ def prepare(connection: socket.socket) -> None:
 
 HANDED_OVER_BYTES = 4096
 KEYS = "keys"
-"""Name of the link to the directory in memory, in the directory of a far end."""
+"""Name of a link in the directory of a far end. The link leads to a directory in memory, which holds the keys of a
+secured mission.
+"""
 
 
 def hand_over(inside: socket.socket, connection: socket.socket, state: dict[str, Any]) -> None:

@@ -31,8 +31,8 @@ computer of the harness.
 WAIT_LIMIT_S = 10.0
 """Seconds of wall time for which a stand-in waits for a connection. After this time, the far end counts as ended."""
 MAX_DELAY_S = 0.02
-"""Maximum delay of the connection in one direction, in seconds of wall time. The maximum is small because some timers
-of a test expire after 0.2 s.
+"""Maximum delay of the connection in one direction, in seconds of wall time. With a longer delay, answers would come
+too late for timers of a test, some of which expire after 0.2 s.
 """
 
 

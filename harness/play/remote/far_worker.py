@@ -106,8 +106,8 @@ class FarWorker:
         self._tasks: set[asyncio.Task[None]] = set()
         self._connection: Connection | None = None
         self._in_step = False
-        """True if the stand-in and this program agree on the positions in the agent's files, so that this program can
-        send more bytes.
+        """True if the stand-in has stated how many bytes of the agent's files it has. This program may then send the
+        next bytes.
         """
         self._pinged_s = self._loop.time()
         self._frames = 0
@@ -372,8 +372,8 @@ class FarWorker:
     # Datagrams and files
 
     def _leave(self) -> bool:
-        """Send the datagrams that the agent broadcast. The trace of the agent already contains their lines. Return true
-        if more frames may wait.
+        """Send the datagrams that the agent has broadcast, after the trace lines that describe them. Return true if
+        more datagrams may wait.
         """
         assert self._network is not None
         datagrams: list[bytes] = []

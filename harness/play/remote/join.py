@@ -45,7 +45,9 @@ REJOIN_LIMIT_S = 60.0
 MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
-"""If a directory has no lock and is at least this number of seconds old, it belongs to a killed process."""
+"""Minimum age in seconds of a directory without a lock that belongs to a killed process. A younger one may be new and
+not yet locked.
+"""
 
 
 class JoinError(HarnessError):
@@ -94,8 +96,9 @@ class FarProcess(Protocol):
 
 
 StartWorker = Callable[[socket.socket, Path, Sequence[str]], Awaitable[FarProcess]]
-"""A function that starts `harness.play.remote.far_worker` in a private network, with its socket, directory and
-command."""
+"""A function that starts `harness.play.remote.far_worker` in a private network. Its arguments are a socket, a
+directory, and the command of the agent.
+"""
 
 
 def join_commands(scenario: Scenario) -> list[str]:
@@ -241,7 +244,9 @@ class _Joining:
                 raise error
 
     async def _play_place(self, connected: JoinedRun | None, run: str, directory: Path) -> NoReturn:
-        """Run one incarnation after another. Raises RunOverError when the run has ended, and JoinError."""
+        """Run one incarnation after another, until RunOverError or JoinError is raised. RunOverError means that the run
+        has ended.
+        """
         while True:
             if connected is not None:
                 await self._play_incarnation(connected, directory)

@@ -53,8 +53,8 @@ KILL_LIMIT_S = 2.0
 ANSWER_LIMIT_S = 9.0
 """Maximum seconds of wall time for an answer of the agent. The harness itself waits for 10 s."""
 STEP_LIMIT_S = 0.05
-"""Maximum jump of the far clock between two incarnations, in seconds. All incarnations must have the same mission
-second 0.
+"""Maximum change of the far clock's offset between two incarnations, in seconds. After a greater change, mission second
+0 would not be the same for all incarnations.
 """
 MAX_REQUEST_BYTES = 65_536
 MAX_DATAGRAM_BYTES = 65_536
@@ -352,7 +352,8 @@ class StandIn:
     def _release(self, data: bytes) -> None:
         """Broadcast a datagram of the remote agent in the lab.
 
-        A restarted agent can send before it is ready, because it continues with the blocks on its disk.
+        The socket may not be open yet: a restarted agent can send before it is ready, because it continues with the
+        blocks on its disk.
         """
         with contextlib.suppress(OSError):  # the datagram counts as lost
             self._open_port().sendto(data, (addresses.BROADCAST, self._task.port))
@@ -437,7 +438,9 @@ class StandIn:
             future.set_result(payload[NUMBER_BYTES:])
 
     def _edited(self, command: str, answer: bytes) -> bytes:
-        """Return the answer of the agent, with numbers and paths that are valid in the lab."""
+        """Return the answer of the agent with the values that are valid in the lab, such as the path of the export in
+        the lab.
+        """
         try:
             document = parse_json(answer)
         except ValueError:

@@ -28,7 +28,9 @@ class CapturedKeys:
         self._random_bytes = random_bytes
         self._opener = DatagramOpener(bundle)
         self._sessions: dict[int, Session] = {}
-        """The forged session for the datagrams of each imitated sender."""
+        """Imitated sender -> the forged session. A session numbers the encrypted datagrams between two restarts of a
+        sender.
+        """
         self._signatures: dict[bytes, bytes] = {}
         """The genuine signatures in received datagrams, by the hash of the signed block."""
 
@@ -65,7 +67,7 @@ class CapturedKeys:
         return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """Return a forged session that imitates a restart of the sender at this moment. The forged session is newer
-        than the sender's genuine session.
+        """Return a forged session of the sender that begins now, as after a restart. Receivers prefer it, because it is
+        newer than the sender's genuine session.
         """
         return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

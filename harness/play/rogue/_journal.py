@@ -18,7 +18,7 @@ class RogueJournal:
         self._write = write
         self._lines: Counter[int] = Counter()
         self._counted: dict[int, dict[str, Any]] = {}
-        """The line of counts of each injection that has not been written yet."""
+        """Number of an injection -> the line of counts for the current mission second, which is not written yet."""
 
     def add(self, injected: RogueDatagram, at_s: float) -> None:
         number, record = injected.injection, injected.to_json(at_s)

@@ -44,9 +44,9 @@ if TYPE_CHECKING:
 MAX_REMEMBERED = 10_000
 """Maximum number of received datagrams that the rogue node keeps for replays."""
 MAX_WAITING = 100_000
-"""Maximum number of datagrams that wait to be sent. At this number, the rogue node creates no further datagrams."""
+"""Maximum number of datagrams that wait to be sent. If this number waits, the rogue node creates no further ones."""
 FLOOD_BATCH = 64
-"""Maximum number of messages of a flood in a row, before the rogue node handles other work."""
+"""Maximum number of messages of a flood that the rogue node sends before it does other work."""
 
 
 QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}
@@ -129,9 +129,7 @@ class RogueLogic:
         self._votes_name_chain = False
         self._known_blocks = KnownBlocks(initial_data, epoch_us)
         self._queries: dict[tuple[int, str], AnsweredRequest] = {}
-        """The identification of the last encrypted query, which an answer must contain. The key is a pair: the sender
-        and the type of the query.
-        """
+        """Sender and type of a query -> identification of the last encrypted query, which an answer must contain."""
         self._windows: list[_ActiveInjection] = []
         self._waiting: list[tuple[float, int, RogueDatagram]] = []
         self._outbox: list[RogueDatagram] = []

@@ -22,7 +22,7 @@ from ucp.messages import (
 )
 
 NOBODYS = b"\xff" * HASH_BYTES
-"""A hash that belongs to no block."""
+"""A hash that is the hash of no block. Forged messages contain it."""
 MADE = "made "
 
 

@@ -5,8 +5,8 @@ from ucp.secure.envelope import CONTROL_NAMES, NAMES, read_clear_header
 from ucp.secure.envelope import VERSION as SECURED
 
 OF_NO_INJECTION = -1
-"""The number that stands in the log for datagrams that belong to no injection, because the scenario contains the
-datagram itself (`harness.scenario.injection`).
+"""The number in the log for datagrams that no injection caused. The scenario contains such a datagram itself
+(`harness.scenario.injection`).
 """
 
 
@@ -38,11 +38,9 @@ def _secured(datagram: bytes) -> dict[str, object]:
 
 
 FORGED_FROM = 1 << 31
-"""First sequence number of forged datagrams. Agents never reach it."""
+"""First sequence number of forged datagrams. It is so high that agents never reach it."""
 _EACH = 1 << 17
-"""Number of sequence numbers that are reserved for each injection. The number is greater than the number of datagrams
-in a flood.
-"""
+"""Number of sequence numbers that each injection may use. No flood has as many datagrams."""
 
 
 def forged_sequence(injection: int, count: int) -> int:

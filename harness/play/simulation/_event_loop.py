@@ -108,7 +108,7 @@ class EventLoop:
         """
         self._foreign_swarm = self._foreign_agents(programs) if scenario.foreign else None
         self._late = {self._number[agent_id]: LateTimers(text) for agent_id, text in scenario.lateness.items()}
-        """The late timers of the agents that the scenario key `lateness` names, by agent number."""
+        """Agent number -> the timers that expire late. Only for agents that the scenario key `lateness` names."""
         with_disk = self.roster if interactive else scenario.with_disk()
         self._with_disk = {self._number[agent_id] for agent_id in with_disk}
         """Numbers of the agents that may reboot with the data on their disks."""
@@ -125,13 +125,15 @@ class EventLoop:
         """Messages for a rogue node that may start later in the run, or None if no rogue node can start."""
         self._sought: SoughtRun | None = None
         self._found: int | None = None
-        """The ID of the agent that ran the handler for which the caller waits."""
+        """The ID of the agent that ran the handler for which the caller waits, or None as long as no agent has."""
         self._stopped_within_instant = False
-        """True if `run` stopped at the handler run for which the caller waits. Other inputs of the same moment may
-        remain.
+        """True if the last call of `run` stopped at the handler run for which the caller waited. Further inputs of the
+        same time may remain.
         """
         self._recent_runs: list[tuple[int, HandlerRun]] | None = None
-        """Handler runs that the last change of the timeline caused. The method `run` sets this list to None."""
+        """Handler runs since the last change of the timeline, which the next call of `until_run` checks first. None if
+        time has advanced since that change.
+        """
         self._recurrence: RecurrenceSearch | None = None
         """The search for an endless cycle, while the swarm becomes idle."""
 
@@ -174,7 +176,7 @@ class EventLoop:
         return VirtualRogue(self.roster, self.seed, self._air, number, write, captured, self._initial_data)
 
     def _late_rogue(self) -> "VirtualRogue":
-        """Return a rogue node that starts during the run, and give it the most recent messages of the run."""
+        """Return a rogue node that starts during the run. It knows the most recent messages of the run."""
         assert self._recent_messages is not None, "a scenario that injects has a rogue node from the beginning"
         rogue = self._rogue_node()
         for sender, sequence, message, sent_at in self._recent_messages:
@@ -423,8 +425,8 @@ class EventLoop:
         self._recorder.write(agent_id, entries)
 
     def _check_sought(self, agent_id: int, run: HandlerRun) -> None:
-        """Check whether a caller waits for this handler run. If the timeline has just changed, only store the handler
-        run. The next call of `until_run` then checks it.
+        """Check whether a caller waits for this handler run. Directly after a change of the timeline, only store the
+        handler run, because the caller starts to wait later.
         """
         if self._recent_runs is not None:
             self._recent_runs.append((agent_id, run))

@@ -26,12 +26,12 @@ from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 
 CHECK_AFTER_S = 120.0
-"""Mission seconds that a swarm gets to become idle before the search for a cycle starts. The search takes computing
-time.
+"""Mission seconds after which the search for a cycle starts. Most swarms become idle before, which saves the computing
+time of the search.
 """
 SAME_INSTANT_S = 1e-6
 MAX_STEPS = 1000
-"""Maximum number of steps of a cycle that are recorded."""
+"""Maximum number of steps of a cycle that the record lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class AgentAtRest:
 
     state: AgentState
     local_s: float
-    """The time on this agent's clock at the next timer expiry of the whole swarm."""
+    """The time on this agent's clock when the next timer of any agent expires."""
     wakes_s: float | None
     """Mission second at which this agent's next timer expires, or None if no timer runs."""
 
@@ -142,7 +142,7 @@ class RecurrenceSearch:
 
 
 def _changeable_by_messages(swarm: Sequence[AgentAtRest]) -> list[object]:
-    """Return the parts of the agents' states that messages can change. The counts of answers are omitted."""
+    """Return the parts of the agents' states that messages can change, except the counts of answers."""
     return [
         (
             state.chain.top_chain_hash,

@@ -16,13 +16,13 @@ from ucp.store import StoredState
 from ucp.trace import Entry, RecordedBytes
 
 AgentOutput = tuple[int, Message | None, RecordedBytes | None]
-"""An output of an agent: sequence number, message, datagram. The datagram is None if the message is not encoded yet. If
-the output is not a message of the agent, its sequence number is 0, and its message is None.
+"""A datagram that an agent sent: sequence number, message, and encoded datagram. The last one is None if the message is
+not encoded yet. For data that are no valid message, the sequence number is 0 and the message is None.
 """
 
 DiskContents = StoredState | tuple[Any]
-"""The content of an agent's disk after a power failure. For a foreign agent, it is a tuple with one value that only the
-agent understands.
+"""The content of an agent's disk after a power failure. A foreign agent (a separate program) has its own format, so its
+content is a tuple with one opaque value.
 """
 
 

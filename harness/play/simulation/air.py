@@ -61,7 +61,9 @@ class MessageInFlight:
 
 
 QueryKind = Literal["vote", "reconcile"]
-"""The two kinds of queries: an agent has at most one open query of each kind."""
+"""The kind of a query: part of a vote or of a reconcile. An agent waits for the answers to at most one query of each
+kind.
+"""
 
 
 @dataclass(slots=True, eq=False)
@@ -75,7 +77,7 @@ class _AnswerLog:
     answer_count: int = 0
     """Number of all answers to the query."""
     quiet_at: float = 0.0
-    """The time after which no further answer to the query arrives."""
+    """The mission second after which no further answer to the query arrives."""
 
 
 @dataclass(slots=True, eq=False)
@@ -85,7 +87,7 @@ class _OpenQuery:
     question: Question
     log: _AnswerLog
     since: "ScheduledInput"
-    """The position of the query in the order of all inputs."""
+    """The input during which the agent sent the query. Answers count only if they come after it."""
     answered_by: set[int] = field(default_factory=set)
     """Senders whose answers to the query the agent has received."""
     answers_seen: int = 0
@@ -127,16 +129,13 @@ class _BroadcastCopies:
 
 
 _UNKNOWN = _BroadcastCopies([])
-"""A placeholder for the copies of a message on a shared channel. The copies are unknown until the frame of the message
-ends.
-"""
+"""A placeholder for the copies of a message on a shared channel. The receivers are known only when the frame ends."""
 
 ScheduledInput = tuple[float, int, int, MessageInFlight | DueEvent | StrayDatagram | None]
-"""A scheduled input: (mission second, rank, agent number, input). The input is a message, an event, or None for a timer
-expiry.
+"""An input of an agent: (mission second, rank, agent number, input). The input is a message, an event, or None for a
+timer expiry. If two inputs have the same time, the one with the lower rank comes first.
 
-The rogue node has the number after the last agent. If two inputs have the same time, the one with the lower rank comes
-first.
+The rogue node has the number after the last agent.
 """
 
 
@@ -173,7 +172,7 @@ class VirtualAir:
         self._quiet_at = 0.0
         """The time at which all messages in transit have arrived. Messages on a shared channel are not included."""
         self.position: ScheduledInput = (0.0, 0, 0, None)
-        """Current position in the order of inputs."""
+        """The input that is being handled."""
         self._roster = roster
         self._settings = settings
         self._medium = medium
@@ -187,8 +186,8 @@ class VirtualAir:
         self._waiting: dict[str, list[tuple[MessageInFlight, int]]] = defaultdict(list)
         self._arrived_at: dict[str, float] = {}
         self._held: dict[int, list[tuple[MessageInFlight, int, float]]] = defaultdict(list)
-        """The messages that each hold delays, by the number of the hold. Each message has its receiver, and its arrival
-        time without the hold.
+        """Number of a hold -> the messages that it delays. Each message has its receiver, and the time at which it
+        would have arrived without the hold.
         """
 
     def deliver_everything(self) -> None:
@@ -401,8 +400,8 @@ class VirtualAir:
         self.busy_until[number] = 0.0
 
     def _open_query(self, number: int, question: Question) -> None:
-        """Mark a query of an agent as open. All answers that arrive later count for this query, even if they answer the
-        same query of another agent.
+        """Record that an agent waits for the answers to a query. Answers that arrive later count, even if they answer
+        an equal query of another agent.
         """
         open_queries = self.open_queries[number]
         about: QueryKind = "vote" if question[0] is BlockAddResponse else "reconcile"

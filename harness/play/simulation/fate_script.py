@@ -19,8 +19,8 @@ NameOf = Callable[[bytes], str | None]
 
 @dataclass(slots=True, eq=False)
 class _ScriptedFate:
-    """A scripted delivery rule (fate) with two counts: the messages that it matched, and the deliveries that it
-    decided.
+    """A rule of the scenario that decides how single messages are delivered, with two counts: the messages that the
+    rule matched, and the deliveries that it decided.
     """
 
     index: int
@@ -28,11 +28,11 @@ class _ScriptedFate:
     matches: int = 0
     decided: int = 0
     arrivals: dict[int, list[float]] = field(default_factory=dict)
-    """The mission seconds at which the copies of a datagram arrive, by the number of the datagram. The matching
-    datagrams are numbered from 0. Only datagrams that have not been sent yet are included.
+    """Number of a datagram -> the mission seconds at which its copies arrive. The datagrams that the rule matches are
+    numbered from 0. Datagrams that were already sent are removed.
     """
     holds: bool = False
-    """True while the fate holds messages and the end of the hold is unknown."""
+    """True while the rule holds messages back without a known end."""
 
     def __post_init__(self) -> None:
         for number, at_s in parse_pairs(self.fate.arrivals or ""):
@@ -68,7 +68,7 @@ class FateScript:
         self.listens = bool(fates)
         """True if there are rules. If it is false, the caller need not call `decide`."""
         self.last_s: float | None = None
-        """The time at which a fate last changed the delivery of a message."""
+        """The time at which a rule last changed the delivery of a message."""
         self._parts = [_ScriptedFate(index, fate) for index, fate in enumerate(fates)]
         self._number = {agent_id: number for number, agent_id in enumerate(roster)}
         self._name_of = name_of
@@ -134,8 +134,8 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of messages that each rule has matched. Messages after the last number in the `count` of a
-        rule are not included, because the rule has no effect on them.
+        """Return the number of messages that each rule has matched. Counting stops at the last message that a rule can
+        affect, so that the counts of a swarm in a cycle become constant.
 
         Return None if the effect of a rule still depends on time.
         """

@@ -49,7 +49,7 @@ class DiskRecorder:
         self._left = defaultdict[int, int](lambda: trace_quota)
         """The number of bytes by which the trace of each agent may still grow."""
         self._written_bytes = 0
-        """Total size of all traces when parts of them were last packed, in bytes."""
+        """Total size of all traces, in bytes, when parts of them were last compressed."""
         self._traces: dict[int, TraceFile] = {}
         self._collected = TraceCollection()
 

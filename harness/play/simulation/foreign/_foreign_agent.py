@@ -175,7 +175,7 @@ class ForeignAgent:
         return self._timer
 
     def silent_until(self) -> float | None:
-        """Return None, because the harness does not know for how long a separate program ignores messages."""
+        """Return None. For a separate program, the harness does not know how long the agent will ignore messages."""
         return None
 
     def outgoing(self) -> Sequence[AgentOutput]:
