@@ -44,8 +44,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list what the new
-    handler does in addition to the original one, such as further messages that it sends.
+    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list the abilities
+    that the original handler lacks, such as further messages to send.
     """
 
     algorithm: int

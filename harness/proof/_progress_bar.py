@@ -17,15 +17,15 @@ Ended = Literal["complete", "flaw", "memory", "time", "interrupted"]
 
 @dataclass(frozen=True)
 class ExplorationProgress:
-    """The progress of an exploration."""
+    """The progress of an exploration, which visits all states of a swarm and computes their successors."""
 
     states: int
-    """Number of known states."""
+    """Number of states found so far."""
     looked_at: int
-    """Number of explored states."""
+    """Number of states whose successors were computed."""
     transitions: int
     depth: int
-    """Number of instants from the initial state to the states that are being explored."""
+    """Number of steps of the swarm from the initial state to the states that are being explored."""
     seconds: float
     asked: str | None = None
     """The question about the whole graph that is now being answered. None until all states are explored."""
@@ -41,11 +41,13 @@ class ExplorationFigures:
     looked_at: int
     transitions: int
     local_states: int
-    """Number of the local states that occur in explored states."""
+    """Number of states of single agents that occur in explored states of the swarm."""
     steps: int
     """Number of steps that real agents computed in all processes."""
     zones: int
-    """Number of the zones that occur in explored states."""
+    """Number of zones that occur in explored states. A zone is a set of possible remaining times of the running
+    timers.
+    """
     depth: int | None
     seconds: float
     """Wall time of the exploration, in seconds."""

@@ -41,7 +41,9 @@ CLAIMS = {
     "crash": "no handler ends by an error",
     "steps": "every step is that of the reference",
 }
-"""Properties that the proof checks in every state: key -> sentence. "steps" is optional."""
+"""Properties that the proof checks in every state. The value of each key is a sentence. The property "steps" is checked
+only on request.
+"""
 OF_CAPTORS = {
     "1": "every accepted message was sent by the vehicle that it names",
     "4": "every block is genuine",
@@ -72,7 +74,7 @@ PLAYED = {
     "crash": "steps",
     "steps": "steps",
 }
-"""Kind of violation -> the check that detects it in a simulated run."""
+"""Kind of violation -> the check of the checker that detects this violation in a simulated run."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +110,11 @@ class Proof:
     flaw: PropertyViolation | None
     """The first violation of a property that the prover found. None if it found none."""
     liveness: ConvergenceResult | None = None
-    """The result of the questions about the whole graph. None if they were not examined, because some states are
-    unknown or the network is `any`.
+    """The answers to the questions about the whole graph, for example about livelocks. None if the questions were not
+    examined, because some states are unknown or messages may be arbitrarily late (network `any`).
     """
     whole_ended: Ended = "complete"
-    """How the examination of the whole graph ended."""
+    """How the examination of the whole graph ended: completely, or at a limit."""
     example: ViolationExample | None = None
     """A scenario that shows a violation. None without a violation. With the network `any`, also None if the prover
     knows no run of the whole swarm with the violation.
@@ -126,7 +128,7 @@ class Proof:
     if no such state is known.
     """
     forms: list[str] = field(default_factory=list)
-    """The forms of all livelocks. The description of a form lists the timers that run in the states of the livelock."""
+    """The forms of all livelocks (endless cycles). A form lists the timers that run in the states of the livelock."""
     livelocks: list[Livelock] = field(default_factory=list)
     """One livelock of each form, with the scenario that shows it. The exploration that found the livelocks may be
     incomplete.
@@ -162,8 +164,10 @@ class Proof:
 
     @property
     def left_open(self) -> bool:
-        """True if the proof cannot decide whether every state has a path to one chain. A state seems to have no such
-        path. But with `zones_contained`, it also represents states with smaller zones, and this may be the only reason.
+        """True if the proof cannot decide whether every state has a path to one chain.
+
+        With the option `zones_contained`, a state also represents states with fewer possible timer values. If such a
+        state seems to have no path to one chain, these other states may be the only reason.
         """
         return self.bounds.zones_contained and self.liveness is not None and self.liveness.lost is not None
 
@@ -290,9 +294,10 @@ def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[Ex
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return the same bounds with a network that loses and duplicates messages, instead of the network `any`.
+    """Return the same bounds with a network that loses and duplicates messages, in place of the network `any`, in which
+    messages may also be arbitrarily late.
 
-    With these bounds, each path is a possible run. With the network `any`, this is not certain.
+    With the new bounds, each path through the states is a possible run. With the network `any`, this is not certain.
     """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
@@ -366,8 +371,8 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
 
 
 def _known_cycles(graph: StateGraph) -> list[list[int]]:
-    """Return the cycles of an incomplete graph. If its zones are not exact, return only those that are found within
-    `CYCLES_LOOKED_FOR_S`.
+    """Return the cycles of an incomplete graph. If a state of the graph can represent several states, a cycle may be
+    impossible. Only cycles that are confirmed within `CYCLES_LOOKED_FOR_S` are then returned.
     """
     if graph.states.exact:
         return [*cycles(graph)]

@@ -157,24 +157,27 @@ class Bounds:
 
     @property
     def nameless(self) -> bool:
-        """True if states are stored without agent IDs. Each agent then counts itself as agent 1. False if an agent is
-        captured or the network is `any`, because messages then depend on the sender's ID.
+        """True if states are stored without the IDs of agents, so that agents with equal states are equal. Each agent
+        then counts itself as agent 1. False if an agent is captured or the network is `any`, because messages then
+        depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 
     @property
     def alike(self) -> bool:
-        """True if states that differ only by an exchange of agents count as one state."""
+        """True if two states count as one state when exchanging agents converts one into the other."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """True if states that differ only by an exchange of blocks count as one state."""
+        """True if two states count as one state when exchanging blocks converts one into the other."""
         return self.nameless and self.clocks_any
 
     @property
     def settles(self) -> bool:
-        """True if each answer to a query arrives or is lost at the same moment at which the query is sent."""
+        """True if each answer arrives or is lost at the moment at which the query is sent, so that no state has
+        messages in transit.
+        """
         return self.reduced and self.captured is None
 
     def agent_settings(self, agent_id: int = 1) -> Settings:

@@ -119,7 +119,9 @@ class ImportRecord(BaseModel):
 AGENTS = "agents"
 FLIGHT_LOGS = "flight-logs"
 INCOMPLETE_LINE = '{"lost_lines":'
-"""The beginning of a trace line that reports lost lines. A truncated trace ends with this text."""
+"""The beginning of a trace line that reports lost lines. Written without its end, it marks a trace that ends within a
+line.
+"""
 _COPY_BYTES = 1024 * 1024
 
 

@@ -119,8 +119,8 @@ class FittedModel:
 
 
 class _TransmissionCluster(NamedTuple):
-    """A group of transmissions whose distances are about the same. All of them belong to the same cluster: a link, or a
-    link in a block of time.
+    """Transmissions over one link in one block of time whose distances are about the same: the number of attempts, and
+    the number of messages that arrived. `log_m` is the logarithm of the distance in metres.
     """
 
     log_m: float

@@ -20,8 +20,8 @@ MAX_TIME_US = 2**53
 _BACK_US, _AHEAD_US = 1_000_000, 60_000_000
 _BIN_US = 10_000_000
 _MAX_DRIFT = 0.01
-"""If the rate of a clock differs by more than this from the rate of GPS time, the clock counts as the clock of a
-simulated vehicle. The rates of real clocks differ by at most 0.0001.
+"""Maximum relative difference between the rate of a real clock and the rate of GPS time. Rates of real clocks differ by
+at most 0.0001, so a greater difference comes from a simulated vehicle that flies faster or slower than real time.
 """
 _SECOND_US = 1_000_000
 _UNKNOWN = object()

@@ -41,7 +41,9 @@ for longer does not show the time at which it passed the place.
 _BIN_US = 1_000_000
 _MIN_VOTES = 3
 _MIN_SHARE = 0.5
-"""Minimum share of the positions of a moving vehicle that must agree on a time difference."""
+"""Minimum share (0 to 1) of the positions of a moving vehicle that must agree on a time difference between agent and
+log.
+"""
 _SAME_FLIGHT_S = 60.0
 _NEAR_M = 1_000.0
 _DAY_US = 86_400_000_000

@@ -277,10 +277,10 @@ class TraceReader:
     def _before_mixed_lines(
         self, incarnations: list[TraceIncarnation], left_out: list[UnusedPart]
     ) -> list[TraceIncarnation]:
-        """Return the incarnations before the place at which the lines of several agents become mixed in the file.
+        """Return the parts of the trace before the place at which the lines of several agents become mixed in the file.
 
-        Trace lines do not name their agent, so mixed lines cannot be used. The mixture is detected if an incarnation
-        sent datagrams with the ID of another agent whose header is also in the file.
+        Trace lines do not name their agent, so mixed lines cannot be used. Lines are mixed if one part sent datagrams
+        with the ID of another agent whose header is also in the file.
         """
         agents = {life.header.agent_id for life in incarnations if life.header is not None}
         for position, life in enumerate(incarnations if len(agents) > 1 else ()):

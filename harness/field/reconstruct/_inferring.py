@@ -89,7 +89,7 @@ class _IncarnationRecord:
     is_last: bool
 
     def since(self, at_s: float) -> "_IncarnationRecord":
-        """Return the part of the agent's records from its restart at `at_s` on."""
+        """Return the later part of these records, beginning with a restart of the agent at `at_s`."""
         received = [sighting for sighting in self.received if sighting.at_s >= at_s]
         logged_events = [timed for timed in self.logged_events if timed[0] >= at_s]
         return _IncarnationRecord(received, self.sent, logged_events, self.is_last)
@@ -210,8 +210,10 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent in one incarnation. `deferred` maps the number of a timer to the
-    number of inputs by which its expiry is moved away from its most likely position.
+    """One possible order of the inputs of an agent between two restarts.
+
+    At first, each timer expires at its most likely position among the other inputs. `deferred` maps the number of a
+    timer to the number of inputs by which its expiry is moved from there.
     """
 
     def __init__(
@@ -227,12 +229,12 @@ class _InputSequence:
         self.inputs: list[RecordedInput] = []
         self.problem: str | None = None
         self.choices: list[int] = []
-        """The number of other possible positions of each timer."""
+        """Number of a timer -> number of other possible positions of its expiry among the inputs."""
         self._header = header
         self._agent = _agent(header)
         self.pause: Pause | None = None
-        """A pause of the process that this order of inputs implies: the agent had a message to send, but sent no
-        message for a long time.
+        """A pause of the process that follows from this order of inputs: although the agent had a message to send, it
+        sent nothing for a long time. None without a pause.
         """
         self._pauses = pauses
         self._inputs_to_play: list[tuple[float, Cause]] = [

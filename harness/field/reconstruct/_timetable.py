@@ -122,15 +122,13 @@ def _from_zero(clocks: Mapping[int, ClockLine], rehearsals: Mapping[int, SoloSim
 
 
 class _DatagramsBySender:
-    """The datagrams that each simulated agent sent. The class also finds the agents that sent a given datagram."""
+    """The datagrams that each simulated agent sent, in order. `of` finds the agents that sent a given datagram."""
 
     def __init__(self, rehearsals: Mapping[int, SoloSimulation]) -> None:
         self._rehearsals = rehearsals
         self.sent: dict[int, list[bytes]] = {agent: [] for agent in rehearsals}
         self._sent_by: dict[int, list[int]] = {agent: [] for agent in rehearsals}
-        """The position of the input that caused each datagram. The list of a sender has one element for each datagram
-        that the sender sent.
-        """
+        """Agent -> for each datagram that the agent sent, the position of the input that caused it."""
         self._numbers: dict[bytes, list[tuple[int, int]]] = defaultdict(list)
         for agent, rehearsal in rehearsals.items():
             for place, played in enumerate(rehearsal.played):
@@ -140,8 +138,8 @@ class _DatagramsBySender:
                     self._sent_by[agent].append(place)
 
     def of(self, datagram: bytes, receiver: int) -> list[tuple[int, int]]:
-        """Return each case in which an agent other than the receiver sent this datagram, as a pair: the agent, and the
-        number of the datagram among those that the agent sent.
+        """Return the senders of this datagram except the receiver. Each sender comes with the number of the datagram
+        among all datagrams that this sender sent.
         """
         return [sent for sent in self._numbers.get(datagram, ()) if sent[0] != receiver]
 
@@ -150,7 +148,9 @@ class _DatagramsBySender:
         return self._rehearsals[agent].played[self._sent_by[agent][number]].input.at_s
 
     def deliveries(self) -> list[DeliveredMessage]:
-        """Return one delivery for each reception of a datagram that was sent only once."""
+        """Return the sending time and the receiving time of each received datagram whose sender is certain, because
+        exactly one agent sent it.
+        """
         found = []
         for receiver, rehearsal in self._rehearsals.items():
             for played in rehearsal.played:

@@ -32,16 +32,14 @@ some milliseconds.
 """
 
 MAX_DOUBTS = 3
-"""Maximum number of places in a record that can be explained by a damaged line. If there are more such places, the
-replay assumes that the agent made mistakes.
+"""Maximum number of places at which a damaged line may explain a deviation. If there are more such places, the replay
+assumes that the agent made the mistakes.
 """
 MAX_TRIED = 20
 """Maximum number of deviations for which damage to a line is tried as an explanation."""
 
 PERHAPS = "perhaps"
-"""A word in the reason why a step was not judged. A description of damage that may explain a deviation follows this
-word.
-"""
+"""The word that marks an uncertain reason for a step that was not judged, as in "perhaps a line is missing"."""
 
 _OF_TIMERS = frozenset(handler.name for handler in ON_TIMER.values())
 
@@ -278,8 +276,8 @@ class RecordPlayer:
             result.lost.append(follower.lost)
 
     def _excuse(self, deviations: list[StepDeviation]) -> str | None:
-        """Return a reason why the deviations may not be errors of the agent, such as missing lines. Return None without
-        such a reason.
+        """Return a reason why the deviations may not be mistakes of the agent, such as missing lines. Return None if no
+        such reason exists.
         """
         if (why := self.record.unrecorded.get(self.position)) is not None:
             return f"{why},"
@@ -290,11 +288,11 @@ class RecordPlayer:
         return self._doubt(deviations)
 
     def _doubt(self, deviations: list[StepDeviation]) -> str | None:
-        """Describe damage to a single line that would also explain the deviations. Return None if no damage explains
-        them.
+        """Return the damage to a single line that would also explain the deviations at this position. Return None if no
+        damage explains them.
 
-        Such damage is rare. If it explains more than a few places in a record, the deviations count as mistakes of the
-        agent. A line is only assumed to be joined from two lines if the record has no deviation without explanation.
+        Such damage is rare. If it would explain more than `MAX_DOUBTS` places in a record, the deviations count as
+        mistakes of the agent. Damage that joins two lines counts only if the record has no unexplained deviation.
         """
         if self.record.is_counted:
             return None

@@ -27,7 +27,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger
 
 _ChainSteps = dict[bytes, tuple[bytes, str]]
-"""The previous chain hash, and the block between both hashes, by chain hash."""
+"""Chain hash -> the chain hash below it, and the hash of the block between them."""
 
 
 class ResumptionSearch:
@@ -155,13 +155,10 @@ def _is_hex(text: str) -> bool:
 
 
 WITHIN = 200
-"""The detector searches this number of lines before an entry, and the same number of lines after it, for a clock
-change.
-"""
+"""Number of trace lines before an entry, and after it, in which the detector searches for a change of the clock."""
 MESSAGES = 3
-"""Size of two groups of messages between the agent and one other agent. One group is before a possible clock change,
-the other after it. The detector compares the median time differences of both groups. If no groups of this size differ,
-the detector also tries smaller groups at the first and the last messages.
+"""Number of messages before a possible change of the clock, and after it, whose median time differences are compared.
+If no such groups differ, the detector also tries smaller groups at the first and the last messages.
 """
 MIN_SHIFT_S = 1.0
 """Minimum change of a clock, in seconds, that the detector reports."""
@@ -214,7 +211,7 @@ class ClockChangeDetector:
 
 
 class _Jump(NamedTuple):
-    """A change of the difference of two clocks, in seconds. It happened between the two entries at these positions."""
+    """A change of the difference between two clocks, in seconds, between the trace entries at these two positions."""
 
     by_s: float
     last_old: int

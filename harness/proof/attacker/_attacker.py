@@ -26,7 +26,7 @@ MOST_KNOWN = 200_000
 
 
 class _KnowledgeFromAgent(NamedTuple):
-    """The blocks, hashes and queries that the attacker learned from one agent."""
+    """The blocks, hashes and queries that the attacker learned from the broadcasts of one agent."""
 
     asked: PendingQuestions
     committed: frozenset[Block]
@@ -37,8 +37,8 @@ class _KnowledgeFromAgent(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps before, between and after the timestamps of `blocks` honest blocks. With these timestamps, up to
-    `lies` forged blocks can have any age relative to honest blocks.
+    """Timestamps for forged blocks. They lie before, between and after the timestamps of `blocks` honest blocks, so
+    that up to `lies` forged blocks can have any age relative to honest blocks.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:

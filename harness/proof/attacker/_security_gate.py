@@ -36,7 +36,7 @@ class SecurityGate:
         self._captured = captured
         self._sequence = 0
         self._mouths: dict[int, Session] = {}
-        """Sender -> the session with which the attacker sends in this sender's name."""
+        """Sender -> the session in which the attacker sends in the name of this sender."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
         """Return an agent that checks signatures. If `revoked` is true, the agent knows that the captured vehicle is

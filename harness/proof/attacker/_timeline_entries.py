@@ -14,8 +14,8 @@ Document = dict[str, Any]
 
 
 class AttackEntries:
-    """The timeline entries for the attacker's messages on one path through the states. `made` contains the blocks that
-    the attacker created, by hash.
+    """The timeline entries of a scenario for the messages that an attacker sends on one path through the states. `made`
+    maps the hash of each block that the attacker created to the block.
     """
 
     def __init__(self, local: LocalStates, captured: int, made: Mapping[bytes, Block]) -> None:
@@ -60,7 +60,9 @@ class AttackEntries:
         return [entry]
 
     def word(self) -> None:
-        """Complete all timeline entries. Call this method when the whole path is known."""
+        """Fill in the block names and mission seconds of all timeline entries. Call this method when the whole path is
+        known.
+        """
         for entry, message in self._lies:
             entry["lie"] |= self._said(message)
 

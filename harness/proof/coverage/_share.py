@@ -16,8 +16,8 @@ from harness.proof.model._shape import HeldBlockOrder, Shape, shape_of
 
 @dataclass
 class ExistingStates:
-    """The agent states and (state, input) pairs that exist within `bounds`. If `ended` is "complete", the object
-    contains all of them.
+    """The states of an agent, and the pairs of a state and an input, that exist within the bounds of a proof. The
+    object contains all of them only if `ended` is "complete".
     """
 
     bounds: Bounds
@@ -64,8 +64,8 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class CoverageShare:
-    """The number of existing states, inputs or branches that runs reached, and the number that runs reached outside the
-    bounds.
+    """How much of the existing states, inputs or branches runs have reached: the number within the bounds of a proof,
+    and the number outside of them.
     """
 
     reached: int

@@ -29,11 +29,9 @@ BRANCHES: tuple[Branch, ...] = tuple(
 """All branches in the agent contract."""
 
 MOST = 2_000_000
-"""Maximum number of local states that are stored, and also the maximum number of pairs. A larger number would need too
-much memory.
-"""
+"""Maximum number of stored local states, and of stored (state, input) pairs. It limits the memory."""
 KEPT = 20_000
-"""Maximum number of cached `HeldBlockOrder` objects."""
+"""Maximum number of cached `HeldBlockOrder` objects. Each one describes the blocks that an agent holds."""
 
 
 @dataclass
@@ -113,8 +111,8 @@ class CoverageWatcher:
 
 
 def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
-    """Return a description of an input that does not depend on the run. `held` contains the blocks that the agent held
-    before the input. Return None for an input that does not exist in any proof.
+    """Return a description of an input that is the same in every run with the same blocks in the same order. `held`
+    contains the blocks that the agent held before the input. Return None for an input that does not exist in any proof.
     """
     if run is None:
         return None

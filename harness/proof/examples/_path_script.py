@@ -35,7 +35,7 @@ that they arrive before it.
 """
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
-"""A text for paths whose ties contradict each other. On such a path, each of two blocks would have to be older than the
+"""A text for paths that need impossible clocks. On such a path, each of two blocks would have to be older than the
 other, or the clock of an agent would have to go back.
 """
 
@@ -44,8 +44,8 @@ Document = dict[str, Any]
 
 @dataclass(eq=False)
 class _BroadcastOnPath:
-    """A broadcast message on a path through the state graph. `count` numbers the messages of the same sender and
-    type.
+    """A message that an agent broadcasts on a path through the state graph. `count` is its number among the messages of
+    the same sender and type.
     """
 
     sender: int
@@ -58,8 +58,8 @@ class _BroadcastOnPath:
 
 @dataclass
 class _AgentOnPath:
-    """An agent on a path through the state graph. For each running timer, `timers` contains the number of the timer
-    among all timers that the agent started, and the time of its expiry.
+    """An agent on a path through the state graph. `timers` contains, for each running timer, its number among all
+    timers that the agent started, and the time of its expiry.
     """
 
     agent_id: int
@@ -94,7 +94,9 @@ class PathScript:
         self._events: list[Document] = []
         self._ages = BlockAges()
         self.contradictory = False
-        """True if no clocks can give all ties the results that the path requires. `document` sets it."""
+        """True if the path needs impossible clocks, because its comparisons of the ages of blocks contradict each
+        other. `document` sets this value.
+        """
         self.losses = 0
         """Number of messages that are lost on the path, counted once per receiver. `document` sets it."""
         self._timeline: list[Document] = []
@@ -161,7 +163,7 @@ class PathScript:
     # Times
 
     def _runs(self) -> list[TimerRun]:
-        """Return the interval in which each timer of the path is running."""
+        """Return, for each timer on the path, the first and the last step during which it runs."""
         running: dict[tuple[int, int], tuple[int, float]] = {}
         runs = []
         for instant, move in enumerate(self._moves):

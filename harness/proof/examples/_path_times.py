@@ -17,7 +17,9 @@ from harness.proof.model._block_renaming import Ordinals
 from ucp.clock import MICROSECONDS
 
 DISTANCES_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
-"""Minimum number of seconds between two steps. The first of these values that allows a solution is used."""
+"""Minimum distances of two steps in seconds, to try in this order. The first one with which all timer durations are
+possible is used.
+"""
 FIRST_INSTANT_S = 1.0
 
 
@@ -48,7 +50,9 @@ def instants_s(count: int, runs: Sequence[TimerRun]) -> list[float]:
 
 
 def windows_s(count: int, runs: Sequence[TimerRun]) -> list[tuple[float, float]]:
-    """Return the earliest and the latest second of each of the `count` steps, measured from the first step."""
+    """Return the earliest and the latest possible second of each of the `count` steps of a path, measured from the
+    first step.
+    """
     later = _bounds(count, runs, 0.0, punctual=True)
     begin = [0.0, *[-inf] * (count - 1)]
     earliest = _longest_paths(begin, later)
@@ -117,7 +121,9 @@ class BlockAges:
         self._events.append(len(self._events))
 
     def renumber(self, blocks: Ordinals) -> None:
-        """Renumber the blocks. The given blocks become 1, 2 and so on, and blocks that no agent holds follow them."""
+        """Change the numbers of the blocks after a step. The given blocks become 1, 2 and so on. Blocks that no agent
+        holds follow them.
+        """
         if blocks:
             rest = [ordinal for ordinal in range(1, len(self._events) + 1) if ordinal not in blocks]
             self._events = [self._events[ordinal - 1] for ordinal in (*blocks, *rest)]

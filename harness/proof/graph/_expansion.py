@@ -14,7 +14,7 @@ from harness.proof.questions._attractor import ByTimer
 
 NumberOf = Callable[[State], int]
 _Following = dict[Actions, dict[int, None]]
-"""Actions of an instant -> the numbers of the possible successor states, in order."""
+"""The actions at one moment -> the numbers of the possible successor states, in order."""
 
 
 class StateExpansion(NamedTuple):
@@ -77,8 +77,8 @@ def _quiet(
 
 @contextmanager
 def cycles_left_alone() -> Iterator[None]:
-    """Switch off Python's garbage collection of reference cycles. In processes that are forked inside the context, this
-    garbage collection stays off.
+    """Switch off Python's garbage collection of reference cycles inside the context. It also stays off in processes
+    that are forked inside the context.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -92,10 +92,11 @@ def cycles_left_alone() -> Iterator[None]:
 class StateStore(Sequence[State]):
     """The states of a swarm as bytes, numbered in the order in which they were added.
 
-    The function `contains` takes two zones, and returns true if the first one contains the second one. A new state
-    whose zone is contained in the zone of a stored state with the same agents then gets the number of the stored state.
-    This is correct because each run from the new state is also a run from the stored state. Without `contains`, only
-    equal states have the same number.
+    A state contains a zone, a set of possible remaining times of the timers. The function `contains` takes two zones,
+    and returns true if the first one contains all times of the second one. If the zone of a stored state contains the
+    zone of a new state, and their agents are in the same states, then each run from the new state is also a run from
+    the stored one. The new state therefore gets the number of the stored state. Without `contains`, only equal states
+    have the same number.
     """
 
     def __init__(self, agents: int, contains: Callable[[int, int], bool] | None = None) -> None:
@@ -150,7 +151,9 @@ class SuccessorStore(Sequence[ByTimer]):
     def __init__(self) -> None:
         self._flat = array("i")
         self._ends = array("q", [0])
-        """The successors of state n are in `_flat` from `_ends[n]` up to `_ends[n + 1]`."""
+        """Index of a state -> the index in `_flat` at which its successors begin. They end where the successors of the
+        next state begin.
+        """
 
     def append(self, by_timer: ByTimer) -> None:
         for after in by_timer:

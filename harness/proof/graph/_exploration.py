@@ -26,14 +26,16 @@ class StateGraph:
 
     swarm: ModelSwarm
     exact: bool = False
-    """If false, a state can also represent states with smaller zones, which are contained in its own zone."""
+    """True if a state represents only itself. If false, it may also represent states whose timers have fewer possible
+    values.
+    """
     states: StateStore = field(init=False)
     parents: "array[int]" = field(default_factory=lambda: array("q"))
     """The state from which each state was first reached."""
     quiet: SuccessorStore = field(default_factory=SuccessorStore)
-    """State -> the field `by_timer` of its `StateExpansion`."""
+    """State -> its successors without a lost message and without a new block, by the timer that expires."""
     crossing: dict[int, tuple[int, ...]] = field(default_factory=dict)
-    """State -> the field `crossing` of its `StateExpansion`."""
+    """State -> its successors in which several timers expire at the same moment, so that messages cross."""
     transitions: int = 0
     depth: int = 0
     seconds: float = 0.0
@@ -70,8 +72,8 @@ class StateGraph:
         return number
 
     def take_in(self, expansion: StateExpansion) -> None:
-        """Store the successors of the next state. The caller must call this method once for each state, in the order of
-        the state numbers.
+        """Store the successors of the next state. Call this method exactly once for each state, in the order of the
+        state numbers.
         """
         number = len(self.quiet)
         self.transitions += expansion.transitions

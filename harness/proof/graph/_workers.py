@@ -31,22 +31,21 @@ from harness.run.parallel import FailedTask, WorkerProcess, signals_blocked
 WAIT_S = 0.5
 """Maximum number of seconds to wait for an answer of a worker before memory and time are checked again."""
 WORTH_WORKERS = 500
-"""Minimum number of unexplored states at which the workers are used."""
+"""Minimum number of waiting states for which worker processes are used. For fewer states, they would save no time."""
 CHUNK = 100
 """Maximum number of states in one task of a worker."""
 MAX_REPORTED = 500_000
-"""Maximum number of states that a worker remembers as reported.
-
-Above this number, the worker forgets these states and reports them again.
+"""Maximum number of states that a worker remembers having sent to the main process. Above this number, the worker
+forgets them and sends them again.
 """
 
 Definitions = list[tuple[int, Any]]
-"""State numbers of the sending process, each with the definition of the state."""
+"""Number of a state in the sending process -> definition of the state."""
 
 
 class StateBatch(NamedTuple):
-    """States that one process sends to another process, in a flat array. It includes the definitions that the receiver
-    does not have yet.
+    """States that one process sends to another process, in a flat array of numbers, together with the definitions that
+    the receiver does not have yet.
     """
 
     locals: Definitions
@@ -94,7 +93,9 @@ class WorkerAnswer(NamedTuple):
 
 
 class _NumberTranslator:
-    """A translator between the state numbers of two processes. Numbers below `alike` are equal in both processes."""
+    """A translator between the numbers of two processes for the same states. Numbers below `alike` were assigned before
+    the fork, so they are equal in both processes.
+    """
 
     def __init__(self, alike: int, content: Callable[[int], Any], adopt: Callable[[Any], int]) -> None:
         self._content = content
@@ -217,7 +218,7 @@ class _WorkerHandle:
         self._translator = _StateTranslator(swarm)
         self._worker: WorkerProcess[StateBatch | ForkedStates, WorkerAnswer] = WorkerProcess(_WorkerFunction(swarm))
         self._numbers: list[int] = []
-        """The main process's numbers of the states that the worker has reported, in the order of the reports."""
+        """The states that the worker has sent, as numbers of the main process, in the order in which they were sent."""
 
     @property
     def connection(self) -> Connection:
@@ -325,8 +326,8 @@ class Workers:
     def _answers(
         self, give: Give, states: Sequence[State], check: Check, first: int = 0
     ) -> Iterator[tuple[_WorkerHandle, int, SuccessorBatch | NeededVotes]]:
-        """Yield the answers of the workers in the order of the tasks. Each answer comes with its worker, and with the
-        number of the first state of its task. `states` may grow during the loop.
+        """Yield the answers of the workers in the order of the tasks, each with its worker and with the number of the
+        first state of its task. `states` may grow during the loop.
         """
         if not self._handles:
             with signals_blocked():  # a Ctrl-C inside a fork must not end it halfway

@@ -1,14 +1,14 @@
-"""Explore each agent alone (network model `any`). The agent may receive every message that any agent can ever have
-sent.
+"""Explore each agent alone, in a network that may lose, duplicate, delay and reorder messages without limit (network
+model `any`).
 
-A message may be lost, duplicated, delayed for any time and overtaken. An agent can therefore receive each sent message
-at any moment, any number of times. Otherwise an agent does not depend on the other agents, with one exception: no agent
-can mention a block before the block is completed.
+In such a network, an agent can receive each message that any agent has sent at any moment, any number of times.
+Otherwise an agent does not depend on the other agents, with one exception: no agent can mention a block before the
+block is completed.
 
 The local states of each agent and the sent messages are collected together until no new ones appear. The result
 contains every local state and message of every possible run. It may contain more, because some of these messages may
-never occur in the same run. If a property holds for all of these states, it holds in every run. If a property does not
-hold for one of these states, this does not prove that a run violates the property.
+never occur in the same run. A property of all collected states therefore holds in every run. If one of the states
+violates a property, it is not certain that a run does.
 """
 
 import time
@@ -28,7 +28,9 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 LOOK_EVERY = 500
 
 Alone = tuple[int, int, int, int]
-"""A single agent: its ID, its local state, its zone, and the number of blocks that it has completed."""
+"""The state of an agent that is explored alone: its ID, its local state, its zone (the possible remaining times of its
+timers), and the number of blocks that it has completed.
+"""
 Said = tuple[int, int]
 """A sent message: the number of the sender and the number of the message."""
 
@@ -52,7 +54,7 @@ class SingleAgentFigures:
     ended: Ended = "complete"
     flaw: PropertyViolation | None = None
     way: list[str] = field(default_factory=list)
-    """The actions and received messages that led the agent to the flaw."""
+    """The actions and received messages that led the agent to the violation."""
     shown: set[str] = field(default_factory=set)
     """Characteristics that an attacker violates although the agents are correct."""
 
@@ -113,7 +115,9 @@ def divisions(agents: int, blocks: int, captured: int | None = None) -> Iterator
 
 
 class _BlockDistribution:
-    """The exploration of one distribution of the blocks among the agents."""
+    """The exploration for one distribution of the blocks among the agents. A distribution states which agent completes
+    which block.
+    """
 
     def __init__(self, collected: SingleAgentFigures, makers: tuple[int, ...]) -> None:
         self._collected = collected
@@ -137,9 +141,7 @@ class _BlockDistribution:
         the agent's states in which the exploration has delivered these messages.
         """
         self._looked_at = 0
-        """Number of states in which the exploration has tried the agent's own actions (the actions without a received
-        message).
-        """
+        """Number of states whose own actions were explored. An own action needs no received message."""
 
     def collect(self, began: float) -> Iterator[ExplorationProgress]:
         """Explore until no new states or messages appear. Yield the progress."""
@@ -234,8 +236,8 @@ class _BlockDistribution:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
-        """Deliver all messages that the attacker can send to an agent in each of these states. Return true if a message
-        is new.
+        """Let the attacker send each possible message to an agent in each of these states. Return true if any of these
+        messages is new.
         """
         if self._heard is None:
             return False

@@ -14,7 +14,7 @@ from ucp.chain import Chain
 from ucp.messages import Message
 
 Ordinals = tuple[int, ...]
-"""Ordinals of blocks. The ordinal of a block is its number among all completed blocks."""
+"""Numbers of blocks. A block's number is its position among all completed blocks, counted from 1."""
 Completed = tuple[bytes, int, int]
 """A completed block: its hash, the number of the agent that completed it, and its ordinal."""
 
@@ -77,8 +77,8 @@ class NumberedBlocks:
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Return the numbers of the blocks in a state. Each number occurs once. If two states differ only in the
-        identity of their blocks, their blocks are listed in the same order.
+        """Return the numbers of the blocks that occur in an agent's state, each once. The order does not depend on
+        which blocks they are, so states that differ only in their blocks list corresponding blocks in the same order.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 
@@ -96,8 +96,8 @@ class NumberedBlocks:
         yield from sorted(numbers[candidate] for candidate in candidates if candidate)
 
     def exchanged(self, snapshot: Snapshot, exchange: Mapping[int, int]) -> Snapshot:
-        """Return the state with its blocks replaced. `exchange` maps the number of each present block to the number of
-        its replacement.
+        """Return the agent's state with other blocks in place of its blocks. `exchange` maps the number of each block
+        to the number of its replacement.
         """
         us = {self._block(old).timestamp_us: self._block(new).timestamp_us for old, new in exchange.items()}
 

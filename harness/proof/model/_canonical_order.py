@@ -1,8 +1,8 @@
-"""Choose one of the equivalent orders of the agents to represent all of them. Equal agents and equal blocks are
-interchangeable.
+"""Choose one order of the agents in a state to represent all equivalent orders. Agents with equal states and timers can
+change places without an effect, and so can blocks.
 
-The choice depends on the states of the agents and the relations of their timers, but not on the numbers of states and
-zones. The order is therefore the same on all machines, and for any order of exploration.
+The choice depends on the states of the agents and the relations of their timers, but not on the numbers that the prover
+gave to states and zones. The order is therefore the same on all machines, and for any order of exploration.
 """
 
 from collections import defaultdict
@@ -17,13 +17,14 @@ from harness.proof.model._snapshot import NAMES_OF_OTHERS
 from harness.proof.model._zones import ZoneTable
 
 Places = tuple[int, ...]
-"""The previous position of the agent that is now at each position of a state."""
+"""New position of an agent in a state -> its previous position."""
 
 
 class OrderedAgents(NamedTuple):
-    """The agents in their chosen order, their timers in the same order, and the previous position of each agent.
+    """The agents of a state in their chosen order, their timers in the same order, and the previous position of each
+    agent.
 
-    `blocks` contains the previous ordinal of each block, counted from 1. It is empty if the blocks keep their ordinals.
+    `blocks` contains the previous number of each block, counted from 1. It is empty if the blocks keep their numbers.
     """
 
     agents: tuple[int, ...]
@@ -41,7 +42,7 @@ several states.
 
 
 class CanonicalOrder:
-    """A sorter that puts agents into their canonical order.
+    """An object that puts the agents of a state into the order that represents all equivalent orders.
 
     Agents use IDs for each other. `name_of` returns the ID that the agent at one position uses for the agent at another
     position.
@@ -139,14 +140,16 @@ class CanonicalOrder:
                 for place, here in enumerate(named)
             ]
         orders = [
-            _unlike(group, locals_) if self._change_places_freely(group, timers, named) else permutations(group)
+            _distinct(group, locals_) if self._change_places_freely(group, timers, named) else permutations(group)
             for group in _groups(descriptions)
         ]
         for chosen in product(*orders):
             yield tuple(place for group in chosen for place in group)
 
     def _are_one(self, group: Sequence[int], locals_: Sequence[int], timers: Sequence[range]) -> bool:
-        """Return true if these agents are in the same state and no timer of these agents runs."""
+        """Return true if these agents are interchangeable, because they are in the same state and none of their timers
+        runs.
+        """
         return not timers[group[0]] and len({locals_[place] for place in group}) == 1
 
     def _with_blocks(self, locals_: Sequence[int], descriptions: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
@@ -180,7 +183,9 @@ class CanonicalOrder:
         )
 
     def _named(self, local: int, place: int) -> list[set[int]]:
-        """Return, for each kind of vote count, the positions of the agents that the agent at `place` has counted."""
+        """Return, for each kind of vote count of the agent at `place`, the positions of the agents whose votes it has
+        counted.
+        """
         if local == DEAD:
             return [set() for _ in NAMES_OF_OTHERS]
         snapshot = self._local.known[local].snapshot
@@ -191,8 +196,8 @@ class CanonicalOrder:
         return name - 2 if name - 2 < place else name - 1
 
     def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
-        """Return a description of the state with this order of the agents. Orders with equal descriptions lead to the
-        same state.
+        """Return a description of the state with this order of the agents. If two orders have equal descriptions, the
+        states are equal.
         """
         new_place = {old: new for new, old in enumerate(places)}
         named = [
@@ -225,10 +230,10 @@ def _groups(descriptions: Sequence[Any]) -> list[list[int]]:
     return [list(group) for _, group in groupby(in_order, descriptions.__getitem__)]
 
 
-def _unlike(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
+def _distinct(group: Sequence[int], locals_: Sequence[int]) -> Iterator[Places]:
     """Yield all orders of these positions that lead to different sequences of states."""
     if not group:
         yield ()
     for first in {locals_[place]: place for place in reversed(group)}.values():
         rest = [place for place in group if place != first]
-        yield from ((first, *others) for others in _unlike(rest, locals_))
+        yield from ((first, *others) for others in _distinct(rest, locals_))

@@ -26,7 +26,7 @@ class PropertyViolation:
 
 
 FLAWS_OF_STEPS = ("crash", "steps", "name", "revoked")
-"""Kinds of violations that are found in a step of an agent. The state after the step does not show them."""
+"""Kinds of violations that only the step itself shows. The state after the step does not show them."""
 
 
 def flaw_of(state: AgentState, completed: Mapping[bytes, int], captured: int | None) -> PropertyViolation | None:
@@ -66,8 +66,6 @@ def is_deceived(state: AgentState, completed: Mapping[bytes, int], captured: int
 
 
 def _makers(state: AgentState) -> dict[bytes, int]:
-    """Return the author of each block that an agent holds, as the block itself names the author. The key is the block
-    hash.
-    """
+    """Block hash -> the agent that the block names as its author, for each block that an agent holds."""
     held = (*state.chain, *state.blocks_to_be_committed, *state.reconcile_stack)
     return {block.block_hash: block.agent_id for block in held}

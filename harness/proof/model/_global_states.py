@@ -35,16 +35,22 @@ The remaining faults are encoded in one number. It has a bit for each fault and 
 remaining numbers of forged messages, coincidences and losses.
 """
 MOST_KNOWN = 200_000
-"""Maximum number of cached instants. Above it, the cache is emptied."""
+"""Maximum number of cached results for actions at one moment. Above it, the cache is emptied."""
 ONCE = (*FAULTS, "captured")
-"""Faults that can happen once. Each has a bit that is set while the fault can still happen."""
+"""Faults that can happen at most once in a run. Each has a bit in the state, which is set while the fault can still
+happen.
+"""
 ALL_LEFT = -1
 LIES = 1 << len(ONCE)
-"""The unit of the remaining number of forged messages."""
+"""The factor of the remaining number of forged messages, in the number that encodes the remaining faults."""
 COINCIDENCES = LIES << (MAX_LIES.bit_length())
-"""The unit of the remaining number of coincidences, if this number is bounded."""
+"""The factor of the remaining number of coincidences, in the number that encodes the remaining faults. Not used if
+coincidences are unlimited.
+"""
 LOSSES = COINCIDENCES << (MAX_COINCIDENCES.bit_length())
-"""The unit of the remaining number of losses, if this number is bounded."""
+"""The factor of the remaining number of losses, in the number that encodes the remaining faults. Not used if losses are
+unlimited.
+"""
 ANY_NUMBER = 1 << 30
 """The number that stands for an unlimited number of losses."""
 BLOCKS, LEFT, ZONE, AGENTS = 0, 1, 2, 3
@@ -97,8 +103,8 @@ class _InstantResults(NamedTuple):
 class ModelSwarm:
     """The states of a swarm within `bounds`, and the transitions between them.
 
-    If `every_count` is true, all existing local states are explored. Agents then receive answers in every order even if
-    they only count them, and keep vote counts even if these have no effect.
+    If `every_count` is true, the prover does not merge states with different vote counts. Agents then receive answers
+    in every order, even if they only count them, and keep vote counts even if these have no effect.
     """
 
     def __init__(self, bounds: Bounds, *, every_count: bool = False) -> None:
@@ -162,8 +168,8 @@ class ModelSwarm:
                 yield actions[0], frozenset(actions)
 
     def ending(self, state: State) -> Iterator[Actions]:
-        """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. Some of these
-        sets may be impossible.
+        """Yield all sets of timers that may expire at the same moment, with at most one timer per agent. The durations
+        of timers may make some of these sets impossible.
 
         If messages must not cross (`bounds.crossing` is false), timers expire one by one.
         """
@@ -191,7 +197,7 @@ class ModelSwarm:
                 continue
             idle_hands = [place for place in alive if all(place != action.place for action in timers)]
             for count in range(1, min(left, len(idle_hands)) + 1):
-                for places in self._unlike(state, permutations(idle_hands, count)):
+                for places in self._distinct(state, permutations(idle_hands, count)):
                     completed = (
                         AgentAction(place, "complete", state[BLOCKS] + 1 + index) for index, place in enumerate(places)
                     )
@@ -200,7 +206,7 @@ class ModelSwarm:
                         yield actions
         singly: list[AgentAction] = []
         if left:
-            for (place,) in self._unlike(state, ((place,) for place in alive)):
+            for (place,) in self._distinct(state, ((place,) for place in alive)):
                 singly.append(AgentAction(place, "complete", state[BLOCKS] + 1))
         for bit, fault in enumerate(FAULTS):
             if state[LEFT] >> bit & 1:
@@ -225,8 +231,8 @@ class ModelSwarm:
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[AgentAction]) -> int:
-        """Return the number of independent events that must coincide so that these actions happen next and at the same
-        moment.
+        """Return the number of coincidences that these simultaneous actions need. A coincidence is an event that
+        happens by chance at the same moment as an independent one.
         """
         if self.bounds.timers_any:
             return 0
@@ -239,10 +245,11 @@ class ModelSwarm:
             return len(actions)  # they never happen at once
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
 
-    def _unlike(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
-        """Yield one representative of each group of equivalent choices of agents.
+    def _distinct(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
+        """Yield one of each group of equivalent choices. A choice is a tuple of positions of agents.
 
-        Idle agents in the same local state are equivalent, unless a vote count contains only some of them.
+        Agents without a running timer that are in the same local state are equivalent, unless an agent has counted the
+        votes of only some other agents.
         """
         known = self.local.known
         locals_ = state[AGENTS:]
@@ -288,7 +295,7 @@ class ModelSwarm:
                 )
 
     def _most_lost(self, state: State, lossy: bool) -> int:
-        """Return the maximum number of messages that may be lost at one moment."""
+        """Return the maximum number of messages that may be lost at one moment in this state."""
         if not lossy:
             return 0
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
@@ -348,9 +355,8 @@ class ModelSwarm:
         )
 
     def _running_after(self, at: dict[tuple[int, int], int], there: AgentStates) -> tuple[int, ...]:
-        """Return, for each timer that runs after a step, the number that it had before the step.
-
-        For a timer that was just started, the result contains -1 minus its duration.
+        """Return, for each timer that runs after a step, the number that it had before the step. For a timer that the
+        step started, the result is instead -1 minus its duration in microseconds.
         """
         running = []
         for place, local in enumerate(there.locals):

@@ -1,5 +1,5 @@
-"""Compute the possible results of one instant: timers expire or blocks are completed, and then agents receive all
-messages.
+"""Compute the possible results of one instant. An instant is a moment at which timers expire or blocks are completed,
+and then agents receive all resulting messages.
 
 Several agents may act before they receive each other's messages, so their messages cross. The agents receive the
 messages in any order of the senders. Then they receive the answers to them, and so on until no agent sends a message. A
@@ -32,8 +32,8 @@ ANSWERED = 2
 MOST_KNOWN = 200_000
 """Maximum number of cached outcomes. Above it, the cache is emptied."""
 MOST_SEEN = 500
-"""Maximum number of states that a correct agent can reach by one round of messages. A wrong agent may count messages
-without limit, and exceed this maximum.
+"""Maximum number of states that a correct agent can reach by one round of messages. A faulty agent that counts messages
+without limit could reach more.
 """
 
 
@@ -274,11 +274,11 @@ class InstantOutcomes:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """If the agent only counts these messages, so that their order has no effect, return the possible steps.
-        Otherwise return None.
+        """Return the possible steps if the agent only counts these messages, so that their order has no effect. Return
+        None for all other messages.
 
-        Whether an answer counts depends on the state without the vote counts, and on whether its sender is already in
-        the vote count (docs/explanation/proof.md).
+        Whether an answer counts depends only on the state without the vote counts, and on whether its sender is already
+        counted (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
         matter, others = [], []
@@ -344,10 +344,10 @@ class InstantOutcomes:
             yield step, (*order, *others)
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
-        """Return the indices of the messages that may change the agent or cause an answer, either directly or after
-        other messages of this round.
+        """Return the indices of the messages that may change the agent or cause an answer, directly or after other
+        messages of this round.
 
-        Return all indices if a wrong agent reaches new states again and again by the same messages.
+        Return all indices for a faulty agent that reaches new states again and again by the same messages.
         """
         seen, waiting = {local}, [local]
         matter: set[int] = set()
@@ -366,14 +366,14 @@ class InstantOutcomes:
 
 
 def _keep(results: dict[AgentStates, FinalMessageRound], there: AgentStates, ending: FinalMessageRound) -> None:
-    """Store this path to a result, unless a path with as few lost messages is already stored."""
+    """Store this way to reach a result, unless a stored way loses at most as many messages."""
     known = results.get(there)
     if known is None or ending.lost < known.lost:
         results[there] = ending
 
 
 def _keep_fullest(orders: dict[_Key, tuple[int, ...]], there: _Key, order: tuple[int, ...]) -> None:
-    """Store this path to a result, unless a path with as many different messages is already stored."""
+    """Store this way to reach a result, unless a stored way contains at least as many different messages."""
     known = orders.get(there)
     if known is None or len(set(order)) > len(set(known)):
         orders[there] = order
@@ -406,6 +406,6 @@ def _is_covered(step: AgentStep, outcomes: Sequence[_Outcome]) -> bool:
 
 
 def _is_part(some: tuple[int, ...], of: tuple[int, ...]) -> bool:
-    """Return true if `of` contains all elements of `some` in the same order."""
+    """Return true if all elements of `some` occur in `of`, in the same order."""
     rest = iter(of)
     return all(message in rest for message in some)

@@ -30,7 +30,7 @@ WHAT_ONLY_CHECKS_READ: Snapshot = {"completed": [], "newest_block_timestamp_us":
 
 @dataclass(frozen=True, slots=True)
 class KnownLocalState:
-    """A known state of the agent with the ID `agent_id`."""
+    """A state of the agent with the ID `agent_id` that was found during the exploration."""
 
     agent_id: int
     snapshot: Snapshot
@@ -42,9 +42,8 @@ class KnownLocalState:
     """The numbers of the blocks in the agent's chain."""
     flaw: PropertyViolation | None
     anonymous: int
-    """A number that is equal for states that differ only in the identity of voters and responders.
-
-    The number is equal on all machines.
+    """A number that is equal for states that differ only in which agents voted or answered. It is the same on all
+    machines.
     """
     names_others: bool
     deceived: bool
@@ -128,12 +127,14 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """Return the number of the state whose renaming with these IDs (`renamed`) gives this state."""
+        """Return the number of the state to which `renamed` with these IDs would give this state. It undoes the
+        renaming.
+        """
         return self.renamed(local, _back(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
-        """Return new IDs for the other agents that put the counted agents first, and the sender after them. Return None
-        if no change is needed.
+        """Return new IDs for the other agents, as an agent sees them: counted agents come first, and the sender
+        follows. Return None if the IDs are already in this order.
 
         If states are stored without agent IDs, an agent behaves in the same way with the new IDs
         (docs/explanation/proof.md).
@@ -158,7 +159,7 @@ class KnownStates:
         return None if in_order == self.others else _back(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
-        """Return true if a vote count in the state contains some of the other agents but not all."""
+        """Return true if the agent has counted the votes or answers of some other agents but not of all."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 

@@ -37,11 +37,13 @@ from ucp.state import AgentState
 from ucp.store import StoredState
 
 Content = tuple[int, Snapshot, "PropertyViolation | None", Ordinals]
-"""The definition of a local state in the form in which processes exchange it."""
+"""The definition of a local state in the form in which processes send it to each other."""
 
 
 OTHER_COUNTS = ((1, 0.0), (2, 60.0), (1000, 10_000.0))
-"""Values of the counters, and mission seconds, with which each step of an unreduced proof is repeated."""
+"""Values of the counters, and mission seconds, with which the prover repeats each step to show that they have no
+effect. Only in proofs without merged states.
+"""
 COUNTED = ("reconciles", "sent", "chain_changed_at")
 """Attributes of the state that only count events, each with its name in error messages."""
 
@@ -105,7 +107,7 @@ class LocalStates(KnownStates):
         return step
 
     def lets_be(self, local: int, sender: int, message: int) -> bool:
-        """Return true if the message has no effect on the agent."""
+        """Return true if the message has no effect on the agent in this state."""
         if self._nameless and not self.known[local].names_others:
             sender = FIRST_OTHER  # it is one to the agent who says it
         key = local, sender, message
@@ -204,9 +206,9 @@ class LocalStates(KnownStates):
         return step
 
     def _got_in(self, local: int, message: int) -> PropertyViolation | None:
-        """Return a violation if the agent accepts a message that it must reject: a message of a revoked vehicle, a
-        forged message in the name of a third vehicle, or a message with a forged block in the receiver's own name.
-        Otherwise return None.
+        """Return a violation if the agent accepts a message of the attacker that it must reject. These are messages of
+        a revoked vehicle, messages in the name of a third vehicle, and blocks in the receiver's own name. Return None
+        if the agent rejects the message.
         """
         known, said = self.known[local], self.messages[message]
         revoked = self.agents.revoked[known.agent_id]
@@ -227,7 +229,7 @@ class LocalStates(KnownStates):
         return self.agents.gate.sealed(said, NOW_S, genuine=genuine)
 
     def state(self, local: int) -> AgentState:
-        """Return the agent's data in this state. The object is valid until the next step is computed."""
+        """Return the agent's data in this state. The returned object changes when the next step is computed."""
         return self._restored(local).state
 
     def inputs(self) -> Iterator[tuple[int, Message | str | None, AgentStep]]:
@@ -343,7 +345,9 @@ class LocalStates(KnownStates):
     # Blocks
 
     def pattern(self, local: int) -> int:
-        """Return one state that represents all states that differ from this state only in their blocks."""
+        """Return the number of the state in which blocks 1, 2, ... replace the agent's blocks. All states that differ
+        only in their blocks have the same result.
+        """
         if not self.bounds.blocks_alike or local == DEAD:
             return local
         pattern = self._patterns.get(local)
@@ -352,8 +356,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks in a state. Each number occurs once. If two states differ only in the
-        identity of their blocks, their blocks are listed in the same order.
+        """Return the numbers of the blocks that occur in a state, each once. States that differ only in their blocks
+        list corresponding blocks in the same order.
         """
         about = self._about.get(local)
         if about is None:
@@ -362,7 +366,7 @@ class LocalStates(KnownStates):
         return about
 
     def exchanged(self, local: int, blocks: Ordinals) -> int:
-        """Return the state in which these blocks replace the blocks that `about` lists."""
+        """Return the state with these blocks in place of the blocks that `about` returns."""
         if blocks == self.about(local):
             return local
         key = self.pattern(local), blocks
@@ -413,7 +417,7 @@ class LocalStates(KnownStates):
         return known.agent_id, known.snapshot, flaw, initiated
 
     def adopt(self, content: Content) -> int:
-        """Return the number of a state that another process found."""
+        """Return this process's number for a state that another process found."""
         agent_id, snapshot, flaw, initiated = content
         self.blocks.learn_chain_hash(snapshot["top_chain_hash_at_initiation"], initiated)
         agent = self.agents.put_into(agent_id, snapshot)

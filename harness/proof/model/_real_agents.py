@@ -19,14 +19,15 @@ from ucp.quirks import wrong_handlers
 
 INITIAL_DATA = b"proof"
 AT_ONCE_S = 0.05
-"""Number of seconds. A timer with a shorter duration expires before any answer can arrive, because a message takes 2 to
-50 ms.
+"""Duration in seconds. A timer with at most this duration expires before any answer can arrive, because a message takes
+2 to 50 ms.
 """
 MOST_AT_ONCE = 100
 
 
 class RealAgents:
-    """One real agent for each ID. If a vehicle is captured, the agents check signatures.
+    """One real agent for each ID, which the prover sets to the states that it explores. If a vehicle is captured, the
+    agents check signatures.
 
     If states are stored without agent IDs (`nameless`), each agent has its own settings, but all agents have the ID of
     the first one.
@@ -70,13 +71,13 @@ class RealAgents:
         return agent
 
     def leave_in(self, agent_id: int, snapshot: Snapshot) -> None:
-        """Record that the agent is now in this state. The next call of `put_into` then replaces only the parts that
-        differ.
+        """Record the state in which the agent is now. The next call of `put_into` then replaces only the parts that
+        differ, which is faster.
         """
         self._left_in[agent_id] = snapshot
 
     def made(self, ordinal: int) -> Block:
-        """Return the block that an agent completes as the block with the number `ordinal`."""
+        """Return block number `ordinal`, as this agent would complete it."""
         agent = self.new(FIRST)
         log(agent, ordinal)
         if agent.state.current_block:
@@ -107,10 +108,10 @@ def log(agent: Agent, ordinal: int) -> None:
 
 
 def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
-    """Let a timer of an agent expire. If `oldest` is given, this block becomes the oldest candidate of reconcile phase
-    2.
+    """Let a timer of an agent expire. If `oldest` is given, this candidate becomes the oldest one in phase 2 of the
+    reconcile, so that it wins a tie.
 
-    The inception block is always older.
+    The inception block is older than any candidate.
     """
     if oldest is not None:
         counted = agent.state.reconcile_response_dictionary[oldest]

@@ -21,12 +21,12 @@ from ucp.state import AgentState
 Shape = tuple[Any, ...]
 
 LEFT_OUT = frozenset(("current_block", "completed", "newest_block_timestamp_us", "voters", "reconcile_responders"))
-"""Parts that a shape omits in addition to those that a snapshot omits: the parts that are used to make blocks, and the
-members of tallies.
+"""Parts of an agent's state that a shape omits, although a snapshot contains them: the parts that are used to make
+blocks, and the members of vote counts.
 """
 
 ELSEWHERE = -1
-"""The ordinal that stands for a block that the agent does not hold."""
+"""The position that stands for a block that the agent does not hold."""
 ON_TOP = "on top"
 """A name in a shape. It stands for the chain hash that the agent's chain would have after appending the block in the
 message.
@@ -34,7 +34,7 @@ message.
 
 
 class HeldBlockOrder:
-    """The chain of an agent, and all blocks that it holds, sorted. The object is immutable."""
+    """The chain of an agent, and all blocks that it holds in the order of their ages. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 

@@ -26,10 +26,10 @@ the mission second is `NOW_S`. An unreduced proof repeats each step with other c
 an agent whose step depends on them.
 """
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
-"""The counters in `REPORTED` that are numbers and that no input sets."""
+"""The attributes in `REPORTED` that are counters and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
-"""Attributes that never change, or that refer to the same objects as included parts. Explored agents do not encrypt
-events.
+"""Attributes that need not be in a snapshot. They never change, or refer to the same objects as other attributes in it.
+Explored agents do not encrypt events.
 """
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
@@ -37,13 +37,13 @@ LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 NOW_S = 1000.0
 """The mission second at which each step is computed. The zones contain the relevant times."""
 RUNNING_S = 1e15
-"""The deadline of a timer that was running before the input."""
+"""The deadline that a timer gets in a computed step if it was running before the input."""
 
 MESSAGE_NAMES = tuple(message.NAME for message in ON_MESSAGE)
 
 Snapshot = dict[str, Any]
 NameOf = Callable[[bytes], int]
-"""A function that returns the number of a hash. It is always the same for the same hash."""
+"""A function that returns a number for a hash, always the same for the same hash."""
 
 
 _DEAD_VOTE: Snapshot = {
@@ -59,7 +59,9 @@ _DEAD_PHASE_3: Snapshot = {"majority_response_block_hash": None}
 
 
 def take(agent: Agent, like: Snapshot | None = None) -> Snapshot:
-    """Return a snapshot of the agent's state. The snapshot shares all parts that are equal in the snapshot `like`."""
+    """Return a snapshot of the agent's state. To save memory, it shares all parts that are equal in the snapshot
+    `like`.
+    """
     state = vars(agent.state)
     if like is None:
         return {name: _copied(value) for name, value in state.items() if name not in LEFT_OUT}
@@ -150,7 +152,7 @@ def replaced(value: Any, hash_of: Callable[[bytes], bytes], block_of: Callable[[
 
 
 def keyed(value: Any, name_of: NameOf) -> Any:
-    """Return a part of the state as numbers and tuples. Equal parts give equal results on all machines."""
+    """Return a part of the state as nested tuples of numbers. Equal parts give equal results on all machines."""
     key = _KEYED.get(type(value))
     return value if key is None else key(value, name_of)
 
@@ -271,7 +273,9 @@ class AgentStep(NamedTuple):
 
 
 class TimerResult(NamedTuple):
-    """A possible result when a timer expires. This result occurs if `oldest` is the oldest candidate of phase 2."""
+    """A possible result when a timer expires. If `oldest` is given, the result occurs if this candidate of phase 2 is
+    the oldest one.
+    """
 
     step: AgentStep
     oldest: bytes | None

@@ -17,7 +17,8 @@ timer.
 
 
 class VoteCounts:
-    """The simplified vote counts of each agent state after all messages of an instant.
+    """The vote counts of agent states after all messages of an instant, replaced by simpler ones that lead to the same
+    decision.
 
     The function `ends` takes the number of a state and the index of a timer in `timers`. It returns the possible
     results of the timer's expiry, which the real agent computes. If `every_count` is true, the vote counts of a
@@ -52,7 +53,7 @@ class VoteCounts:
         return number
 
     def _left(self, local: int) -> Snapshot:
-        """Return the simplified vote counts of a state."""
+        """Return the simplified vote counts of a state, as parts that replace those of the state."""
         known = self._states.known[local]
         snapshot = known.snapshot
         left: Snapshot = {}
@@ -104,7 +105,7 @@ class VoteCounts:
         return {"reconcile_response_dictionary": left, "reconcile_responders": {*self._states.others}}
 
     def _silent(self, snapshot: Snapshot) -> int:
-        """Return the number of other agents that have not yet answered."""
+        """Return the number of other agents whose answers the agent has not counted yet."""
         return len(self._states.others) - len(snapshot["reconcile_responders"])
 
     def _check_that_it_ends_alike(self, local: int, settled: int) -> None:

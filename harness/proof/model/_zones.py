@@ -17,7 +17,7 @@ from collections.abc import Sequence
 Matrix = tuple[tuple[int, ...], ...]
 NOTHING_RUNS = 0
 EVER_US = 10**15
-"""A duration that is longer than any timer, in microseconds."""
+"""A number of microseconds that is longer than the duration of any timer."""
 
 
 class ZoneTable:
@@ -76,8 +76,8 @@ class ZoneTable:
         return tied
 
     def bounds(self, zone: int) -> list[tuple[int, ...]]:
-        """Describe each timer by its lower and upper bounds. The description does not depend on the order of
-        the timers.
+        """Describe each timer by its smallest and its largest possible remaining time. The descriptions do not depend
+        on the order of the timers.
         """
         bounds = self._bounds.get(zone)
         if bounds is None:
@@ -109,8 +109,8 @@ class ZoneTable:
         return self._permuted[key]
 
     def adrift(self, zone: int) -> int:
-        """Return the zone in which the differences between timers are the same as in this zone, and the remaining time
-        until the first expiry is arbitrary.
+        """Return the zone with the same differences between the timers, and with any remaining time until the first
+        expiry.
 
         If no other event can happen before the first expiry, the time until then makes no difference.
         """
@@ -123,12 +123,11 @@ class ZoneTable:
         return self._adrift[zone]
 
     def coincidences(self, zone: int, ended: tuple[int, ...]) -> int:
-        """Return the number of independent events that must coincide so that these timers expire next and at the same
-        moment.
+        """Return the number of coincidences that are needed for these timers to expire next and at the same moment. The
+        timers must be able to expire at the same time.
 
-        Timers whose differences are fixed form a group. When these timers expire at the same moment, groups merge. The
-        result is the number by which the number of groups decreases. The timers must be able to expire at the same
-        time.
+        Timers whose differences are fixed form a group. If timers of different groups expire at the same moment, this
+        is a coincidence, and the groups merge. The result is the number by which the number of groups decreases.
         """
         key = zone, ended
         if key not in self._coincidences:
@@ -140,9 +139,8 @@ class ZoneTable:
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
-        """Return the bounds at the moment at which these timers expire, if no other timer has expired before.
-
-        Return None if this moment is impossible.
+        """Return the bounds of all timers at the moment at which these timers expire first. Return None if this moment
+        is impossible.
         """
         matrix = [list(row) for row in self._matrices[zone]]
         size = range(len(matrix))
@@ -184,7 +182,7 @@ class ZoneTable:
 
 
 def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
-    """Return the number of groups of timers. Timers whose differences are fixed belong to the same group."""
+    """Return the number of groups of timers. In a group, the differences of the remaining times are fixed."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)
         for timer in timers

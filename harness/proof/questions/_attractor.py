@@ -5,20 +5,20 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 
 ByTimer = tuple[tuple[int, ...], ...]
-"""The numbers of the possible successors of a state, for each timer that may expire next."""
+"""For each timer that may expire next in a state, the numbers of the possible successors."""
 
 Check = Callable[[], object]
-"""The type of a function that is called repeatedly. It raises LimitReachedError when the limit of memory or time is
-reached.
+"""A function that is called repeatedly during the computation. It raises LimitReachedError when the limit of memory or
+time is reached.
 """
 
 
 class BackwardReachableStates:
-    """A growing set of states: the goals, and all states from which the swarm reaches a goal.
+    """A growing set of states: goals, and all states from which the swarm reaches a goal.
 
-    The durations of timers determine which timer expires next, but in a zone, several timers may be the next one. Each
-    of these timers must lead to a goal, unless timers expire in `any_order`. If timers must expire at the same moment,
-    only the transit times of messages determine their order, so one order that leads to a goal is enough.
+    In most states, several timers may expire next. Each of these timers must lead to a goal, unless timers expire in
+    `any_order`. If timers must expire at the same moment, only the transit times of messages determine their order, so
+    one order that leads to a goal is enough.
     """
 
     def __init__(self, by_timer: Sequence[ByTimer], any_order: bool, check: Check = lambda: None) -> None:
@@ -26,7 +26,7 @@ class BackwardReachableStates:
         self._any_order = any_order
         self._inside = bytearray(len(by_timer))
         self._open = array("q", map(len, by_timer))
-        """The number of timers of each state that are not yet known to lead to a goal."""
+        """State -> the number of its timers that are not yet known to lead to a goal."""
         self._whose = array("q", (number for number, choices in enumerate(by_timer) for _ in choices))
         """The state to which each timer belongs. The timers of all states are numbered consecutively."""
         self._leads = bytearray(len(self._whose))

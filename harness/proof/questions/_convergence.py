@@ -16,9 +16,8 @@ from harness.proof.questions._extra_votes import ExtraVotes, UndecidedError
 from harness.proof.questions._graph_cycles import cycles
 
 Watch = Callable[[str], None]
-"""The type of a function that is called repeatedly with the question that is being answered.
-
-It raises LimitReachedError when the limit of memory or time is reached.
+"""A function that is called repeatedly with the question that is being answered. It raises LimitReachedError when the
+limit of memory or time is reached.
 """
 
 

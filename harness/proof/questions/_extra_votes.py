@@ -15,15 +15,15 @@ from harness.proof.model._known_states import DEAD
 from harness.proof.questions._attractor import BackwardReachableStates, ByTimer, Check
 
 MAX_EXPLORED = 50_000
-"""Maximum number of states that are explored after the votes of one state.
+"""Maximum number of states to explore after the votes of one state.
 
-With wrong agents, the number of states can be infinite. Above the limit, the question remains undecided.
+With faulty agents, the number of states can be infinite. Above the limit, the question remains undecided.
 """
 MAX_CACHED = 200_000
 """Maximum number of states for which the number of votes is cached."""
 MAX_PATH_INSTANTS = 150
-"""Maximum number of instants on a single path, including those of all votes. If a path is longer, all successors are
-explored instead.
+"""Maximum number of steps of the swarm on a single path, including those of all votes. If a path is longer, all
+successors are explored instead.
 """
 
 
@@ -49,8 +49,10 @@ class ExtraVotes:
         """
 
     def needed(self, fork: State) -> int | PropertyViolation | None:
-        """Return the smallest number of votes that makes all chains equal. If one vote per agent is not enough, return
-        a violation that ended a path after further votes, or None without a violation. Raises UndecidedError.
+        """Return the smallest number of votes that makes all chains equal.
+
+        If one vote per agent is not enough, return the violation that ended a path after further votes, or None if
+        there was none. Raises UndecidedError.
         """
         if len(self._enough) + len(self._too_few) > MAX_CACHED:
             self._enough.clear()

@@ -15,7 +15,7 @@ from harness.proof.model._global_states import AGENTS, ZONE, State
 from harness.proof.questions._attractor import ByTimer, Check
 
 OUTSIDE = -1
-"""The number of a state outside the explored part."""
+"""The number that stands for all states outside the explored part."""
 
 
 def cycles(graph: StateGraph, check: Check = lambda: None) -> Iterator[list[int]]:
@@ -60,7 +60,7 @@ def _with_exact_zones(graph: StateGraph, part: Sequence[int], check: Check) -> S
 
 
 def _agents(state: State) -> State:
-    """Return a state without its zone."""
+    """Return the part of a state that does not concern the remaining times of timers."""
     return (*state[:ZONE], *state[AGENTS:])
 
 

@@ -1,4 +1,5 @@
-"""Describe the endless cycles of agents, and write an example of each form with its conditions.
+"""Describe the livelocks (endless cycles of agents), and write an example of each form with the conditions under which
+it occurs.
 
 Two cycles have the same form if the same timers run in their states. The agents and the chains make no difference.
 """

@@ -54,7 +54,7 @@ NO_MESSAGE = TYPE_CODES[RequestForBlock], IMPOSSIBLE
 
 
 class UnreadableError(Exception):
-    """An error: a trace line cannot be compared with the specification. The message is one sentence."""
+    """An error: a trace line cannot be encoded for a comparison with the specification. The message is one sentence."""
 
 
 class EncodedTimestamp(int):
@@ -78,12 +78,12 @@ class EncodedIncarnation:
     whole: bool = True
     """True if no steps are missing at the end."""
     unread: str | None = None
-    """The reason why the lines after these steps could not be encoded. None if all lines are encoded."""
+    """The reason why later lines of the trace could not be encoded. None if all lines are encoded."""
 
 
 class ChainNumbers:
-    """A numbering of chains. The inception block alone is the first chain. A chain that extends a numbered chain by a
-    block gets a new number.
+    """A numbering of chains, in place of chain hashes. The chain that consists of the inception block alone is the
+    first one. A chain that extends a numbered chain by a block gets a new number.
     """
 
     def __init__(self) -> None:

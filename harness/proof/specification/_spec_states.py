@@ -21,7 +21,7 @@ from ucp.settings import CHOICES, DECLARED, Settings
 from ucp.state import AgentState
 
 Plain = tuple[Any, ...]
-"""An agent as nested tuples, or all agents."""
+"""The state of an agent or of all agents as nested tuples. It is the same for real agents and for the specification."""
 
 TIMERS: dict[Staggered, tuple[str, str]] = {
     "vote_timeout_s": ("VoteTimeout", "VoteStagger"),
@@ -52,7 +52,7 @@ def specified(graph: Path) -> Iterator[Plain]:
 
 
 def goes_round(graph: Path) -> bool:
-    """Return true if the state graph that TLC wrote has a cycle."""
+    """Return true if the state graph that TLC wrote contains a cycle, which is an endless run."""
     after: dict[str, set[str]] = defaultdict(set)
     with graph.open() as lines:
         for line in lines:

@@ -22,15 +22,15 @@ from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 
 STEPS_AT_ONCE = 20_000
-"""Number of handler runs at which a batch is complete. A trace is never divided, so a batch may contain more handler
-runs.
+"""Minimum number of handler runs in a batch for one TLC process. A trace is never divided, so a batch may contain
+more.
 """
 MEMORY_MB = 2048
 
 Constants = tuple[tuple[str, object], ...]
 
 AT_END = "what it triggered has yet to run"
-"""The difference that TLC reports if a handler was triggered but had not run by the last step."""
+"""The name of the difference that TLC reports at the last step if a handler was triggered but did not run."""
 
 _REJECTED = re.compile(r'<<\s*"rejected",\s*(\d+),\s*(\d+),\s*\{([^}]*)\}\s*>>')
 _WHAT = re.compile(r'"([^"]*)"')
