@@ -22,8 +22,8 @@ class AgentUnderTest(ABC):
     def __init__(self, variant: SettingsVariant) -> None:
         self.model = ReferenceModel(variant.settings)
         self.reference_follows = True
-        """True while the state of the reference equals the state of the agent. False if the machine was late and the
-        reference could not follow.
+        """True while the reference implementation is in the same state as the agent. A slow machine can make this
+        impossible.
         """
 
     async def step(self, given: AgentInput) -> TestedStep | None:
@@ -46,7 +46,7 @@ class AgentUnderTest(ABC):
     @property
     @abstractmethod
     def timer_is_near(self) -> bool:
-        """True if the agent's next timer expires soon, so that its expiry must be the next input."""
+        """True if the agent's next timer expires so soon that no other input can come before it."""
 
     @abstractmethod
     def exchanges(self) -> tuple[RecordedDatagram, ...]:
@@ -58,8 +58,8 @@ class AgentUnderTest(ABC):
 
 
 Start = Callable[[SettingsVariant, bool], Awaitable[AgentUnderTest]]
-"""A function that starts an agent with a variant of the settings. If the second argument is true, the agent repeats a
-test, and few agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError.
+"""A function that starts an agent with a combination of settings. The second argument is true for the repetition of a
+test, when few agents run in parallel. Raises NoAgentError, UnsupportedError, AgentEndedError.
 """
 
 

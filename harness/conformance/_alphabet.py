@@ -35,7 +35,7 @@ from ucp.messages import (
 )
 
 UNKNOWN = bytes.fromhex("de" * 32)
-"""A value that is the hash of no block and of no chain."""
+"""A value in the form of a hash that is the hash of no block and of no chain."""
 
 Tally = Literal["voting", "phase one", "phase two", "timer"]
 
@@ -47,16 +47,16 @@ class AgentInput:
     name: str
     make: Callable[[ReferenceModel], Action | None]
     tally: Tally | None = None
-    """The activity in which the effect of the input depends on the answers that the agent has counted. "timer" stands
-    for the activity that ends with the running timer. None if counted answers never affect the input.
+    """The activity in which the agent's counted answers change the effect of the input. "timer" stands for the activity
+    that ends with the running timer. None if counted answers never change the effect.
     """
     counted_twin: str | None = None
-    """Name of a similar answer that the agent must count. None unless the input is an answer that the agent must
-    ignore.
+    """Name of a similar answer that the agent must count. Only for answers that the agent must ignore, and for nothing
+    else.
     """
     preceding: str | None = None
-    """Name of an answer that arrives before a timer expiry and that the agent must ignore. The expiry reveals whether
-    the agent counted this answer. Only timer expiries have this attribute.
+    """Name of an answer that arrives before a timer expiry, and that the agent must ignore. The expiry shows whether
+    the agent counted it. Only for inputs that are timer expiries.
     """
 
 
@@ -144,7 +144,7 @@ def _top_block(model: ReferenceModel) -> Block | None:
 
 
 def _chain_with_popped_block(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain with the most recently popped block on top."""
+    """Return the hash of the chain that results when the most recently popped block is appended again."""
     stack = model.state.reconcile_stack
     return next_chain_hash(_top(model), stack[-1].block_hash) if stack else None
 

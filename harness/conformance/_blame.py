@@ -23,8 +23,8 @@ BLOCK_KEYS = {"chain", "deque", "stack", "completed", "top_chain_hash"}
 """Keys of the status that describe the blocks of the agent."""
 
 Branch = tuple[str, str, bool]
-"""A branch of a handler: the name of the handler, the name of the branch, and true if the handler run changes blocks.
-The last element is needed because one branch of Algorithm 20 changes blocks only in some runs.
+"""The name of a handler, the name of the branch that it took, and true if the handler run changed blocks. The last
+element is needed because one branch of Algorithm 20 changes blocks only in some runs.
 """
 
 STARTED_BY = {timer: handler.name for handler in HANDLERS.values() for timer in handler.starts}
@@ -35,19 +35,18 @@ BEGINNING_OF_COUNT = {
     "reconcile_phase_2_timer_expiration": "reconcile_phase_2",
     "reconcile_phase_3_timer_expiration": "reconcile_phase_3",
 }
-"""Handler of a timer expiry -> the handler that began to count the answers. This expiry evaluates the counted answers.
-"""
+"""Handler of a timer expiry, which evaluates the counted answers -> the handler that began to count them."""
 
 _EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 _LEADING_EVENTS = {"Reconcile Begin", "Reconcile Phase 1"}
-"""Local events whose handlers only trigger another handler."""
+"""Local events whose handlers do nothing but trigger another handler."""
 STARTING_BRANCHES = {"proposed", "asked", "recommitted, more to come"}
 """Branches in which a handler starts a timer."""
 
 
 @dataclass(frozen=True)
 class BlamedBranch:
-    """The branch that most likely caused a failure, and its handler. The reference took this branch."""
+    """The branch that most likely caused a failure, and its handler. The reference implementation took this branch."""
 
     handler: str
     branch: str
@@ -103,8 +102,8 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return true if no test of the same timer expiry without a preceding ignored answer has passed. Return false
-        if the failed test had no such answer.
+        """Return true if the failed test had an ignored answer before a timer expiry, and the same expiry without this
+        answer has passed in no test.
         """
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:
@@ -112,8 +111,8 @@ class BlameEvidence:
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the agent probably began to count answers with a wrong number. An agent with this fault
-        decides correctly after other counts.
+        """Return true if the agent probably began to count answers with a wrong number, because it decides correctly
+        after other counts.
         """
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:

@@ -63,7 +63,9 @@ COMPARED = ("idle", "reconcile_in_progress", "chain", "deque", "stack", "complet
 """Keys of the status that are compared. A key that the agent's status lacks is not compared."""
 SHOWN = 12
 MAX_EARLY_TIMERS = 3
-"""Maximum number of successive timer expiries that are tried as an explanation for an early message."""
+"""Maximum number of timers that the comparison lets expire early, one after another, to explain a message that came too
+early.
+"""
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,8 @@ class TestedStep:
     ended: str | None = None
     """A phrase about the end or the hanging of the agent. None if the agent still runs."""
     hidden_run: ExpectedRun | None = None
-    """A handler run that may be the true cause of the failure. This run handled an answer that the agent must ignore,
-    or it should have stopped a timer.
+    """An earlier handler run that may be the true cause of the failure. It handled an answer that the agent must
+    ignore, or it should have stopped a timer. None if no such run is known.
     """
 
 
@@ -170,7 +172,7 @@ def _timer_expired_early(
     """Return the timer whose early expiry explains the received messages and the status. Return None if no early expiry
     explains them.
 
-    The call advances the model, so the model cannot follow the agent afterwards.
+    The search gives expiries to the reference. Afterwards, the reference is no longer in the state of the agent.
     """
     sent, first = list(expected), next_timer_name(model)
     for _ in range(MAX_EARLY_TIMERS):

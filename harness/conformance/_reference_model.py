@@ -24,8 +24,8 @@ ROSTER = (AGENT, *PEERS)
 STRANGER = 9
 INITIAL_DATA = b"conformance"
 OLD_US, YOUNG_US = 1_000, 2**62
-"""Timestamps of the peers' blocks in microseconds. They are older and younger than all blocks of the agent under
-test.
+"""Timestamps of the peers' blocks in microseconds. The first one is older, and the second one is newer, than the
+timestamps of all blocks of the agent under test.
 """
 EVENT_ID = 7
 

@@ -70,7 +70,7 @@ class AgentState(NamedTuple):
     of the stack. Lengths above a limit count as equal.
     """
     counted: tuple[object, ...]
-    """Answers that the agent has counted in its current activity."""
+    """The answers that the agent has counted in its current activity, which is a vote or a phase of a reconcile."""
 
     @property
     def text(self) -> str:
@@ -266,7 +266,7 @@ have a long chain and an empty stack, so one agent can reach them repeatedly.
 
 
 def _reveals_counting(snapshot: ModelSnapshot, now: float, before: AgentState, given: AgentInput) -> bool:
-    """Return true if the next expiry of the timer would reveal an agent that wrongly counts this input."""
+    """Return true if the next expiry of the timer would show whether the agent has wrongly counted this answer."""
     if (
         (before.activity, before.holdings) not in COUNTING_STATES
         or given.preceding is None
@@ -307,8 +307,8 @@ def handlers_and_messages(outcome: ExpectedOutcome) -> tuple[object, ...]:
 
 
 def _is_redundant(model: ReferenceModel, before: AgentState, given: AgentInput) -> bool:
-    """Return true if the input leads only to states that are equivalent to known ones, or if its effect depends on more
-    than the state.
+    """Return true if a test of this input adds nothing: it leads only to states that are equivalent to known ones, or
+    its effect depends on more than the state.
     """
     if given.name == LOG:
         return len(model.state.blocks_to_be_committed) >= MAX_WAITING

@@ -33,8 +33,8 @@ from harness.errors import UnsupportedError
 MAX_WORKERS = 24
 """Maximum number of agents in parallel."""
 WORKERS_PER_PASS = 0.01
-"""Increase of the maximum number of parallel agents for each passed vector. It applies after the suite has reduced this
-maximum.
+"""Increase of the maximum number of parallel agents for each passed test, after a slow machine has forced the suite to
+reduce this maximum.
 """
 MIN_WORKERS = 6
 """Minimum number of agents in parallel on a machine that is often late."""
@@ -54,9 +54,9 @@ MAX_RETRIES_OF_A_KIND = 2
 MAX_SUSPICIONS = 24
 """Maximum number of suspected failures that are replayed. When this number is reached, the suite stops its tours."""
 MAX_HIDDEN = 16
-"""Maximum number of ignored answers that the suite tests, one after another, as the cause of a failure."""
+"""Maximum number of ignored answers that the suite tries, one after another, as the true cause of a failure."""
 MAX_PATH = 80
-"""Maximum number of inputs in a replay that repeats only the end of a tour."""
+"""Maximum number of inputs when the suite repeats only the last part of a tour."""
 REPETITIONS = 2
 """Number of replays in which a suspected failure must occur again."""
 MAX_ATTEMPTS = 4
@@ -339,9 +339,9 @@ class VectorSuite:
     async def _find_miscounted(
         self, variant: SettingsVariant, path: Sequence[str], failure: ConfirmedFailure, *, needs_earlier_round: bool
     ) -> ConfirmedFailure:
-        """Find out whether the failure disappears if a certain handler gets no answers that it must ignore. If the
-        failure disappears, return it with this handler as its cause. Otherwise return it with the given value of
-        `needs_earlier_round`.
+        """Find out whether the agent counted answers that it must ignore. For each handler of such answers, repeat the
+        inputs without these answers. If the failure disappears, return it with this handler run as its cause. Otherwise
+        return it with the given value of `needs_earlier_round`.
         """
         counted = _ignored_answers(variant, path)
         for handler in dict.fromkeys(run.handler for run in counted.values()):
@@ -399,8 +399,8 @@ def _unexplained_failure(variant: SettingsVariant, suspicion: SuspectedFailure, 
 
 
 def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> ExpectedRun | None:
-    """Return the only handler run that the input `name` causes after the inputs in `path`. Return None if it causes
-    none or several.
+    """Return the handler run that the input `name` causes after the inputs in `path`. Return None if it causes none or
+    more than one.
     """
     model, now = walk(variant, path)
     advanced = advance(model, INPUTS[name], now)
@@ -408,8 +408,8 @@ def _single_run(variant: SettingsVariant, path: tuple[str, ...], name: str) -> E
 
 
 def _ignored_answers(variant: SettingsVariant, path: Sequence[str]) -> dict[int, ExpectedRun]:
-    """Return those of these inputs that are answers which the agent must ignore. The key is the index of the input. The
-    value is the handler run that must ignore the answer.
+    """Index of an input -> the handler run that must ignore it. Contains only inputs that are answers which the agent
+    must ignore.
     """
     model, now = ReferenceModel(variant.settings), 0.0
     uncounted = {}

@@ -19,7 +19,7 @@ from harness.conformance._reference_model import ReferenceModel
 from harness.conformance._state_space import AgentState, AgentTransition, SettingsVariant, VectorKey, key_of, state_of
 
 TIMER_COSTS = 10.0
-"""Cost of a timer expiry on a path. The unit of a cost is about one mission second."""
+"""Cost of a timer expiry on a path between two states. One unit is about one mission second."""
 INPUT_COSTS = 0.3
 START_COSTS = 100.0
 """Cost of starting a new agent. The cost is higher than the duration of a start, because a start uses processor time
@@ -58,16 +58,16 @@ class VectorMap:
             self._unseen[key.activity, key.holdings].add(key)
         self._edges: dict[tuple[str, tuple[str | int, ...], tuple[object, ...]], list[tuple[str, AgentState, float]]]
         self._edges = defaultdict(list)
-        """Activity, holdings and relevant counts of a state -> the transitions from this state. Each transition
-        consists of the input, the next state, and the cost.
+        """Activity, holdings and relevant counts of a state -> the inputs that lead to another state, each with this
+        state and the cost.
         """
         self._quiet: set[VectorKey] = set()
         self._growing: set[VectorKey] = set()
         self._tries: Counter[VectorKey] = Counter()
         self.given_up: list[VectorKey] = []
-        """Vectors for which the machine was late MAX_TRIES times."""
+        """Tests that were abandoned, because the machine was late at MAX_TRIES attempts."""
         self.claimed: set[VectorKey] = set()
-        """Vectors that a tour has reserved and will run soon."""
+        """Tests that a tour will run soon, so that no other tour runs them."""
         for transition in transitions:
             if transition.after == transition.before:
                 self._quiet.add(transition.key)

@@ -68,8 +68,8 @@ class UdpTiming:
     patience_s: float
     """Maximum time to wait for an expected message."""
     calm_s: float
-    """Time for which the status must have the expected values before an input counts as handled. This time applies to
-    an agent that does not count its handler runs as expected.
+    """Time for which the status must stay at the expected values before an input counts as handled. Used for an agent
+    whose counts of handler runs differ from the expected ones.
     """
     linger_s: float
     """Additional time to wait for unexpected messages."""
@@ -82,8 +82,8 @@ TIMING_IN_PARALLEL = UdpTiming(
 )
 TIMING_ALONE = UdpTiming(8.0, margin_s=0.3, early_s=0.1, patience_s=2.5, calm_s=0.3, linger_s=0.1, ask_again_s=0.25)
 MIN_ANSWERS = 2
-"""Minimum number of answers of an agent after which a missing message counts as the agent's fault, and not as that of a
-late machine.
+"""Minimum number of answers to status requests that prove that the agent was running. After fewer answers, a missing
+message may be the fault of a slow machine.
 """
 
 
@@ -235,9 +235,8 @@ class UdpAgent(AgentUnderTest):
         received: Sequence[tuple[float, bytes]],
         status: Mapping[str, Any],
     ) -> bool:
-        """Return true if timers that expired shortly before or after the input explain the agent's messages and status.
-
-        In this case, the model is afterwards in the state of the agent.
+        """Let timers of the reference expire shortly before or after the input. Return true if this explains the
+        agent's messages and status. The reference is then in the state of the agent.
         """
         first, last = (
             (self._mission_s(received[0][0]), self._mission_s(received[-1][0]))

@@ -39,7 +39,7 @@ class VectorSet:
     steps: Sequence[AgentTransition]
     """All transitions of the state space."""
     wanted: Mapping[VectorKey, AgentTransition]
-    """The transitions that are vectors. All other transitions are only steps on the way to a vector."""
+    """The transitions that are tests. All other transitions only lead to the state of a test."""
 
     @cached_property
     def by_key(self) -> dict[VectorKey, AgentTransition]:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate
 
 ByTimer = tuple[tuple[int, ...], ...]
-"""For each timer that may expire next in a state, the numbers of the possible successors."""
+"""The numbers of the possible successors of a state: one group for each timer that may expire next."""
 
 Check = Callable[[], object]
 """A function that is called repeatedly during the computation. It raises LimitReachedError when the limit of memory or

@@ -177,8 +177,10 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Return a tuple: the smallest document found for which `still` returns true, a text about the steps of the
-    reduction, and true if the user interrupted the search.
+    """Reduce a scenario document as long as `still` returns true for it.
+
+    Return the smallest document found, a text about the steps of the reduction, and true if the user interrupted the
+    search.
     """
     interrupted = False
     shrinker = Shrinker(

@@ -47,7 +47,7 @@ class LostMessage:
     """The number of the message among the messages of this type from this sender."""
     block: str | None
     by_quirk: bool = False
-    """True if the message arrived but the receiver ignored it."""
+    """True if the message arrived, but the receiver ignored it because of a deliberate error (quirk)."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class _EventRecorder(MemoryRecorder):
         self.events: list[RecordedEvent] = []
         self.lost: list[LostMessage] = []
         self.sent: dict[tuple[int, int], LostMessage] = {}
-        """(sender, sequence number) of a Commit Block -> the entry for this message in `lost`. The entry is used if a
-        receiver ignores the message.
+        """Sender and sequence number of a sent Commit Block message -> the entry for `lost`. The entry is added to
+        `lost` for each receiver that ignores the message.
         """
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()

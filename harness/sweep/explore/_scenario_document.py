@@ -18,7 +18,9 @@ Document = dict[str, Any]
 UNPLAYED = ("about", "speedup", "expect")
 """Scenario keys that have no effect in virtual time, or that only make sense for the original run."""
 FLIGHT = ("vehicles", "flight", "network.radio")
-"""Keys that only determine which messages are lost because of distance. They have no other effect in virtual time."""
+"""Keys about the flight of vehicles. In virtual time, their only effect is that messages are lost because of
+distance.
+"""
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
 """Parameters with which the model of burst losses never loses a message. The model then draws the same random numbers
 as with losses.
@@ -92,11 +94,11 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a message fate. Because of it, the network loses all messages of this type from this sender to this
-    receiver at about this time.
+    """Return a rule with which the network loses all messages of this type from this sender to this receiver at about
+    this time.
 
-    The fate matches the message by its time. It therefore still matches this message when other messages disappear from
-    the run.
+    The rule identifies the message by its time and not by a number. It therefore still matches this message when other
+    messages disappear from the run.
     """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
@@ -126,8 +128,8 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Return a change of the network without its message losses. The change is a timeline entry or the repeated part of
-    a schedule.
+    """Return a change of the network with its message losses set to zero. The change is a timeline entry or the
+    repeated part of a schedule.
     """
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
@@ -274,7 +276,7 @@ def _limit_duration(entry: Document, last_s: float) -> Document:
 
 
 def move_times(document: Document, to: Callable[[float], float]) -> Document:
-    """Return the document with other times. For each time, the function `to` returns the new time."""
+    """Return the document with other times. The function `to` returns the new time for each time in the document."""
     for key in ("events.script", "timeline"):
         document = with_key(document, key, [_move_entry_times(entry, to) for entry in at(document, key) or []])
     document = with_key(document, "fates", [_move_fate_times(fate, to) for fate in document.get("fates", [])])

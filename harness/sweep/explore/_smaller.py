@@ -1,9 +1,9 @@
 """Define the steps that reduce a scenario. Steps that shorten runs come first, and then steps that simplify the
 scenario.
 
-The fate of a message identifies the message either by a time or by a count. A fate with a time still matches the same
-message if other messages disappear. A fate with a count still matches the same message if everything happens earlier.
-After each change of the form, all steps are tried again.
+A scripted loss (a fate) identifies its message either by a time or by a count. With a time, it still matches the same
+message if other messages disappear. With a count, it still matches the same message if everything happens earlier.
+After each change between these two forms, all steps are tried again.
 
 A document is reduced step by step (delta debugging), to the smallest scenario that still violates a check. The result
 does not depend on the number of processes. The search considers the results of candidate scenarios in a fixed order. If
@@ -45,8 +45,8 @@ from ucp.settings import Settings
 T = TypeVar("T")
 
 WORTH_FORKING_S = 0.03
-"""Minimum duration, in seconds, of runs that are run in parallel. If runs take less time, starting processes would take
-longer than the runs.
+"""Minimum duration of a run, in seconds, for which several processes play runs in parallel. For shorter runs, starting
+the processes would take longer.
 """
 
 
@@ -134,8 +134,8 @@ class Shrinker:
 
 
 def _leaving_out(items: Sequence[T], parts: int) -> Iterator[list[T]]:
-    """Divide `items` into `parts` parts. For each part, yield all items outside this part. The last part comes first,
-    because fewer items depend on later items.
+    """Divide `items` into `parts` parts. For each part, yield all other items. The last part comes first, because fewer
+    items depend on later items.
     """
     bounds = [len(items) * part // parts for part in range(parts + 1)]
     for part in reversed(range(parts)):

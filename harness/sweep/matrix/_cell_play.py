@@ -78,9 +78,11 @@ class RunPlayer:
     judge: Judge = simulated
     """The function that carries out and judges simulated runs."""
     covers: bool = False
-    """True if the coverage of each run is measured. If it is true, `judge` is not used in virtual time."""
+    """True if the coverage of each run is measured. Simulated runs are then not given to `judge`."""
     is_cancelled: Callable[[], bool] | None = None
-    """A function that returns true if a run with real programs must end early, for a thread without signals."""
+    """A function that returns true if a run with real programs must end early. A run in a thread needs it, because only
+    the main thread receives signals.
+    """
 
     def __call__(self, task: MatrixTask) -> Run:
         scenario = self.matrix.scenario_at(task.point)

@@ -158,8 +158,8 @@ def _differ(was: Run, run: Run) -> bool:
 
 
 def is_paired(point: MatrixPoint) -> bool:
-    """Return true if runs of this combination of values are always equal when the code is equal. Only such runs can be
-    compared one by one.
+    """Return true if equal code always gives equal runs for this combination of values, as in virtual time. Only such
+    runs can be compared one by one.
     """
     return BACKENDS[point.backend].plays_in_memory
 

@@ -34,8 +34,8 @@ def find_culprits(
 ) -> list[Culprit]:
     """Search for the commits that made numeric results worse, until the time budget is used up.
 
-    The search considers each cell in virtual time that has a worse result. It uses the code repository from which the
-    harness runs. Ctrl-C ends the search.
+    The search considers each cell with simulated runs whose result became worse. It uses the code repository from which
+    the harness runs. Ctrl-C ends the search.
     """
     regressions = {change.point: change for change in reversed(_paired_regressions(tonight))}
     deadline, culprits = time.monotonic() + budget_s, []

@@ -1,9 +1,8 @@
-"""Estimate the means and shares of numeric results over several runs, with 95 % confidence intervals.
+"""Estimate the means and shares of numeric results over several runs, with 95 % confidence intervals. Also compute the
+numeric results that only a matrix with several swarm sizes or mission lengths needs.
 
 A share of runs has the Wilson interval, which is also valid near 0 and 100 %. The interval of a mean comes from
 Student's t distribution. A single run has no interval, because one value does not show the spread.
-
-Compute the numeric results that are needed only for a matrix with several swarm sizes or mission lengths.
 """
 
 import math
@@ -99,8 +98,8 @@ class Metric:
     result.
     """
     unit: Literal["share of runs", "share", "number"] = "number"
-    """The meaning of the value: "share of runs" for a property that some runs have, "share" for a share within each
-    run, and "number" for any other number.
+    """The kind of value: "share of runs" for a property that a run has or has not, "share" for a share within each run,
+    and "number" for any other number.
     """
     worse: Literal["lower", "higher"] | None = None
     """The direction of change that counts as worse: lower or higher values. None if neither direction is worse."""
@@ -155,7 +154,9 @@ BEFORE_FINAL_RECONCILE = (
         worse="lower",
     ),
 )
-"""Metrics for scenarios with a final reconcile. After this reconcile, other metrics hardly depend on the network."""
+"""Metrics of the swarm before a final reconcile. A final reconcile makes all chains equal, so later values hardly
+depend on the network.
+"""
 BY_NAME = {metric.name: metric for metric in METRICS + BEFORE_FINAL_RECONCILE}
 
 

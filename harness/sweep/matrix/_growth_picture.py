@@ -25,7 +25,7 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 COLUMNS = 3
 HEAD, PANEL_HEIGHT, FOOT = 96, 236, 26
 MAX_LINES = 4
-"""Maximum number of lines in a chart. If there are more, the chart shows an even selection."""
+"""Maximum number of lines in a chart. Of more lines, the chart shows a selection with even distances."""
 TICK_WIDTH = 24.0
 
 
@@ -50,8 +50,8 @@ PANELS = (
     GrowthPanel("Runs with one uniform chain", "uniform"),
 )
 ALSO_OVER_BLOCKS = ("messages", "bytes")
-"""Metrics that get a second chart, with the number of blocks on its horizontal axis, if the matrix has three numbers of
-agents and three mission lengths.
+"""Metrics that get a second chart with the number of blocks on its horizontal axis. This needs a matrix with three
+numbers of agents and three mission lengths.
 """
 
 

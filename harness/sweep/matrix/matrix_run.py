@@ -42,8 +42,8 @@ def informative(
     budget_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> Iterator[MatrixTask]:
-    """Yield tasks until the time budget is used up. `runs` contains the finished results. Whenever a run ends, the
-    caller adds its result to `runs`.
+    """Yield the tasks in the order in which their runs are most useful, until the time budget is used up. `runs`
+    contains the finished results. Whenever a run ends, the caller adds its result to `runs`.
     """
     until = clock() + budget_s
     begun = Counter(task.point for task in runs)
@@ -59,8 +59,8 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return how wide the widest confidence interval of a cell will probably be when all runs that have begun have
-    ended.
+    """Return the expected benefit of a further run of this cell: the probable width of its widest confidence interval
+    when all runs that have begun have ended.
     """
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)
@@ -78,7 +78,7 @@ def _width(estimate: Estimate) -> float:
 
 Outcomes = Iterator[tuple[MatrixTask, Run | FailedTask]]
 Spread = Callable[[Iterable[MatrixTask], RunPlayer], AbstractContextManager[Outcomes]]
-"""A function that distributes tasks, and yields their results in order of completion."""
+"""A function that distributes tasks over processes or machines, and yields each result as soon as it is complete."""
 
 
 MAX_NAMED = 50

@@ -130,8 +130,8 @@ def _load(path: Path) -> MatrixRecord:
 
 
 LAST = 60
-"""Maximum number of night files that are read. If there are more, the last ones in alphabetical order are read. These
-are the newest nights, because the file names begin with the date.
+"""Maximum number of files of nights that are read. Of more files, the newest are read. Their names begin with the date,
+so they are the last ones in alphabetical order.
 """
 
 

@@ -73,8 +73,8 @@ COMPARED = (
 
 @dataclass(frozen=True)
 class ComparisonRow:
-    """One line of the page. It contains the mean of the original, the mean of the variant, and the mean difference
-    between runs with the same seed.
+    """One line of the page: the mean of the original protocol, the mean of the variant, and the mean difference between
+    runs with the same seed.
     """
 
     compared: ComparedValue

@@ -30,8 +30,8 @@ from harness.sweep.explore.guided._hunt_trial import (
 from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
-"""Size of the bit field of a `DigestSet` in bits, which is 32 MiB. If the field contains ten million numbers, it
-mistakes about one of 30 new numbers for a known number.
+"""Size of the bit field of a `DigestSet` in bits. It takes 32 MiB of memory. After ten million numbers, about one in 30
+new numbers seems to be a member.
 """
 
 
@@ -56,22 +56,20 @@ class DigestSet:
 ROUND = 64
 """Number of runs in a round."""
 MOST_KEPT = 3000
-"""Maximum number of stored documents. If there are more, the document with the lowest expected benefit is removed."""
+"""Maximum number of stored scenarios. Above it, the scenario that is least likely to lead to new states is removed."""
 MOST_FAILED = 100
 MAX_PATTERNS = 100_000
-"""Maximum number of patterns of failed votes that are stored. These patterns take 50 MB. Further patterns do not count
-as new.
-"""
+"""Maximum number of stored patterns of failed votes, which take 50 MB. Further patterns do not count as new."""
 WORTH_OF_PATTERN = 100
-"""A new pattern of failed votes is worth as much as this number of new local states."""
+"""Number of new agent states that are worth as much as one new pattern of failed votes."""
 NEWEST = 24
 NEAR_LIVELOCK = 0.6
 SEEDS = 1 << 16
 
 
 class CandidateRun(NamedTuple):
-    """A scenario document, and a seed with which it is run. At the end of the run, the swarm gets an additional phase
-    in which it can become idle.
+    """A scenario document to play, and its seed. At the end of the run, a liveness phase without losses and new events
+    lets the swarm become idle.
     """
 
     document: Document
@@ -100,13 +98,15 @@ class KeptRun:
 
     @property
     def worth(self) -> float:
-        """The expected benefit of running changed copies of this document."""
+        """The expected benefit of playing changed copies of this scenario. It grows with the number of new states, and
+        falls with the number of earlier copies and with the length of the run.
+        """
         return (1 + self.new_states) / (1 + self.picked) / (100 + self.steps)
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of changed copies of this document when the hunt searches for an endless cycle. It is 0
-        if the run of the document had no new pattern of failed votes.
+        """The expected benefit of changed copies if the hunt searches for an endless cycle. It grows with the number of
+        failed votes in the run. It is 0 if the run had no new pattern of failed votes.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 
@@ -143,7 +143,7 @@ class Hunt:
     reached: ReachedStates = field(default_factory=ReachedStates)
     states_overflow: DigestSet = field(default_factory=DigestSet)
     pairs_overflow: DigestSet = field(default_factory=DigestSet)
-    """Digests of the pairs (state, input) that runs reached after the collection `reached` was full."""
+    """Digests of (state, input) pairs that runs reached when the exact collection `reached` was full."""
     kept: list[KeptRun] = field(default_factory=list)
     runs: int = 0
     found: dict[FindingIdentity, CandidateRun] = field(default_factory=dict)
@@ -157,8 +157,8 @@ class Hunt:
     """The first runs that have no verdict, with the reasons. `failures` is the number of all runs without a verdict."""
     _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
-    """The known ways in which the chains of an idle swarm differ. The first run with a new difference is run again with
-    a final reconcile.
+    """The known ways in which the chains of an idle swarm can differ. The first run with a new one is played again with
+    a final reconcile, to see whether the chains become equal.
     """
     _known_patterns: set[TimerPatterns] = field(default_factory=set)
     """The known patterns of failed votes. The first run with a new pattern is stored."""
@@ -175,7 +175,7 @@ class Hunt:
         yield from self._play([*to_reconcile, *(self._next(worth) for _ in range(ROUND))], jobs)
 
     def dropped(self) -> list[CandidateRun]:
-        """Return the documents that were removed since the last call of this method."""
+        """Return the stored scenarios that were removed since the last call of this method."""
         dropped, self._dropped = self._dropped, []
         return dropped
 
@@ -269,7 +269,9 @@ class Hunt:
 
 
 def _count_new(numbers: Iterable[int], exact: Collection[int], overflow: DigestSet) -> int:
-    """Count the numbers that are in neither collection. If `exact` is full, add the new numbers to `overflow`."""
+    """Count the numbers that are in neither collection, and add them to `exact`. If `exact` is full, add them to
+    `overflow`.
+    """
     new = [number for number in numbers if number not in exact and number not in overflow]
     if len(exact) >= MOST:
         for number in new:

@@ -50,7 +50,7 @@ SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 @dataclass(frozen=True, order=True)
 class FindingIdentity:
-    """The identity of a finding."""
+    """The properties by which two findings are recognised as the same one, in any run."""
 
     key: str
     """The key of the check with a bad verdict."""
@@ -104,8 +104,8 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the sequences of timers that agents repeat in an endless cycle, without duplicates. The command `prove`
-    compares livelocks in the same way.
+    """Return the sequences of timers that agents repeat in an endless cycle, each once. The command `prove` uses the
+    same form to compare livelocks.
     """
     patterns = defaultdict[int, list[str]](list)
     for step in cycle.steps:
@@ -125,7 +125,7 @@ def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Maximum number of timers in a pattern. A longer pattern is reduced to its last timers."""
+"""Maximum number of timers in a pattern. Of a longer pattern, only the last timers are kept."""
 
 TimerPatterns = tuple[tuple[str, ...], ...]
 """The timers that expired in each agent, in order of time."""
@@ -172,7 +172,7 @@ MOST_BLOCKS = 12
 nothing about the value of a run.
 """
 LAST_S = 240.0
-"""Lower limit for the mission second up to which agents complete blocks."""
+"""Minimum of the mission second up to which agents complete blocks. It can be later in long scenarios."""
 CLEARED_S = 0.001
 """Seconds between the removal of all network conditions and the end of the mission."""
 LONGEST_GAP_S = 40.0
@@ -180,8 +180,8 @@ LONGEST_GAP_S = 40.0
 
 
 Divergence = tuple[tuple[int, int], ...]
-"""The differences between the chains of a swarm, as a sorted list of pairs. There is one pair for each different chain.
-A pair contains the number of agents that hold the chain, and the number of blocks that follow the mutual chain in it.
+"""The differences between the chains of a swarm: one pair for each different chain, sorted. A pair contains the number
+of agents that hold the chain, and the number of its blocks that are not common to all chains.
 """
 
 

@@ -18,7 +18,7 @@ MOST_ENTRIES = 6
 """Maximum number of entries in the timeline of a changed scenario."""
 ALIGN_PROBABILITY = 0.6
 AFTER_LAST_S = 30.0
-"""Seconds between the last event and the end of a changed scenario. A vote or a reconcile takes less time than this."""
+"""Seconds between the last event and the end of a changed scenario, enough for a vote and a reconcile."""
 FEW_BLOCKS = 4
 MESSAGES = get_args(MessageName)
 READINGS = {name: choice.values[1:] for name, choice in CHOICES.items() if choice.is_reading}
@@ -73,7 +73,7 @@ def mutate(
 
 
 def _limited(document: Document, limits: MutationLimits) -> Document:
-    """Return the document without everything that exceeds the limits. The mission ends soon after the last event."""
+    """Return the document without the parts that exceed the limits. The mission ends soon after the last event."""
     events = [event for event in script(document) if event["at_s"] <= limits.last_s][: limits.blocks]
     last_s = max((event["at_s"] for event in events), default=0.0)
     document = with_events(document, events)
@@ -348,8 +348,8 @@ def _splice(document: Document, other: Document, rng: Random) -> Document:
 
 
 def _moment(document: Document, rng: Random) -> float:
-    """Choose a mission second at random. It is one of the known times, lies between two of them, or is the expiry of a
-    timer that starts at a known time.
+    """Choose a mission second at random. It is near the time of an event or timeline entry, near the expiry of a timer
+    that starts then, or anywhere in the mission.
     """
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]

@@ -44,7 +44,7 @@ INITIAL_RUNS = 4
 SEEDS = 20
 """Number of seeds with which the scenario of a finding is run, to measure how often the finding occurs."""
 RARE = 0.5
-"""Limit for rare findings, as a share of the seeds. A finding that occurs with fewer seeds is rare."""
+"""Share of the seeds (0 to 1). A finding that occurs with a smaller share of the seeds counts as rare."""
 SHRINKING_RUNS = 400
 MOST_AGENTS, MOST_BLOCKS = 3, 3
 """The numbers of agents and blocks of a proof. The coverage of the search is compared with the states of this proof."""

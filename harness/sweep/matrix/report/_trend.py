@@ -26,7 +26,7 @@ COLUMNS, PANEL_HEIGHT, FOOT = 4, 158, 4
 MAX_DOTS = 12_000
 """Maximum number of dots on a page. If there are more, the page shows fewer nights."""
 LARGEST = 1e12
-"""Upper limit of a plausible value. If a file contains larger values, they are ignored."""
+"""Largest plausible value. Larger values in a file are ignored."""
 
 
 def nights_drawn(nights: Sequence[MatrixRecord], tonight: MatrixRecord, figures: int) -> Sequence[MatrixRecord]:
