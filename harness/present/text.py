@@ -8,8 +8,8 @@ from typing import Any
 from rich.text import Text
 
 _EPOCH_FROM_US = 1_000_000_000_000_000
-"""The smallest timestamp, in microseconds, that counts from the Unix epoch. It lies in the year 2001. Smaller
-timestamps count from the start of a run in virtual time.
+"""The smallest timestamp, in microseconds, that counts as time since the Unix epoch. It lies in the year 2001. Smaller
+timestamps are times since the start of a simulated run.
 """
 _LAST_EPOCH_US = 253_402_300_799_000_000
 MAX_WORD = 120

@@ -85,8 +85,8 @@ def draw(left: ReportSource) -> str:
 
 
 def _again(left: ReportSource, scenario: str) -> str:
-    """Return the command that repeats the run. Return an empty text if the run directory does not contain the
-    scenario.
+    """Return the command with which a user can repeat the run. Return an empty text if the run directory does not
+    contain the scenario.
     """
     if not scenario:
         return ""

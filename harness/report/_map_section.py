@@ -28,7 +28,9 @@ from harness.scenario.changes import RANGE
 from sitl.vehicle import VehicleType
 
 MOVES_M = 1.0
-"""If a vehicle moves by at most this number of metres to the north and to the east, it counts as standing still."""
+"""Distance in metres. A vehicle that moves by at most this distance to the north and to the east counts as standing
+still.
+"""
 MOMENTS = 6
 
 

@@ -29,7 +29,7 @@ class ConditionSpan:
     to_s: float
     text: str
     level: float = 1.0
-    """Height of the filled part of the row, as a share of the row's height from 0 to 1."""
+    """Share of the row's height (0 to 1) that the picture fills. It represents the value of the condition."""
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:

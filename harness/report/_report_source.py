@@ -54,8 +54,8 @@ class ReportSource:
 
     @property
     def unmet_expectations(self) -> list[str]:
-        """Sentences about expected results that the run did not show. Sentences about the expected verdicts are not
-        included.
+        """Sentences about results that the scenario expects but the run did not show. Sentences about expected verdicts
+        are not included.
         """
         if not self.record.characteristics:
             return []

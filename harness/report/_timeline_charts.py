@@ -54,7 +54,7 @@ def plot(view: Iterable[Markup], pinned: Iterable[Markup], height: float, end_s:
 
 
 def pin(at_s: float, end_s: float, y: float, shape: Markup) -> Markup:
-    """Draw a shape at this mission second. The shape keeps its size when the user zooms."""
+    """Draw a shape at this mission second outside of the zoomed view. The shape keeps its size when the user zooms."""
     return Markup('<svg class="pin" data-at="{}" x="{}%" y="{}">{}</svg>').format(
         format_number(at_s), format_number(100 * at_s / end_s), n(y), shape
     )
@@ -143,10 +143,10 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Shorten a long list of states.
+    """Return the part of a long list of states that is visible when the picture shows the whole run.
 
-    The result contains only the states that are visible when the picture shows the whole run. For each column of the
-    picture, the result contains the last state and the state with the shortest mutual chain.
+    For each column of the picture, the result contains the last state and the state with the shortest mutual chain,
+    which is the common beginning of all chains.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads

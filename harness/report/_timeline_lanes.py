@@ -164,8 +164,8 @@ def block_label(block: str, names: Mapping[str, str]) -> str:
 
 
 def phases_in_words(reconcile: AgentReconcile) -> str:
-    """Return a text that lists the phases of a reconcile in the order of their first rounds. A phase with several
-    rounds has the number of its rounds.
+    """Return a text that lists the phases of a reconcile in their order. If a phase was repeated, the text contains the
+    number of its rounds.
     """
     rounds: dict[str, int] = {}
     for phase in reconcile.phases:

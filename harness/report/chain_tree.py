@@ -52,8 +52,8 @@ class ChainTreeMark:
 
     kind: Literal["block", "ellipsis", "oval"]
     nodes: list[ChainTreeNode]
-    """The nodes of this mark: the block of a box, the hidden blocks of an ellipsis, or the last block before an
-    oval.
+    """The blocks that the mark stands for: the block of a box, the hidden blocks of an ellipsis, or the last block
+    below an oval.
     """
     lines: list[str]
     holders: list[int]
@@ -314,8 +314,8 @@ def _width(characters: int) -> float:
 
 
 def _offsets(placed_marks: list[PlacedMark]) -> dict[int, float]:
-    """Return the horizontal distance between each mark and the mark below it. The keys are the Python object IDs of the
-    marks.
+    """Return the horizontal distance between each mark and the mark below it. A key is the Python object ID of a
+    mark.
     """
     offsets: dict[int, float] = {}
     outlines: dict[int, _SubtreeOutline] = {}

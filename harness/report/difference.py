@@ -91,8 +91,8 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """Yield a difference for each innermost key whose values differ, in the order of `a`. Two lists with different
-    lengths give one difference for the whole list.
+    """Yield each scenario key whose value differs, in the order of `a`. For nested values, this is the innermost key.
+    Two lists with different lengths give one difference for the whole list.
     """
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]

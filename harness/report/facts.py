@@ -161,7 +161,7 @@ def gaps(captured: Mapping[str, CapturedFrames]) -> str | None:
 
 
 def link_qualities() -> list[str]:
-    """Return the texts that explain the link qualities in the legend. The first text explains the best quality."""
+    """Return the texts that explain the link qualities in the legend, beginning with the best quality."""
     limits = map(text.percent, QUALITY_LIMITS)
     return ["link", *(f"link that loses {low} to {high}" for low, high in pairwise(limits))]
 

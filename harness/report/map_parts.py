@@ -26,7 +26,9 @@ MAX_NAMED = 6
 
 @dataclass(frozen=True, slots=True)
 class NetworkDivision:
-    """A division of the swarm into groups of connected vehicles (*parts*), from one network change to the next."""
+    """A division of the swarm into groups of connected vehicles (*parts*). It lasts from one network change to the
+    next.
+    """
 
     at_s: float
     """The mission second of the change with which the division begins."""
@@ -60,10 +62,10 @@ class NetworkDivision:
         return self.together if vehicle in self.together else frozenset({vehicle})
 
     def changed_since(self, before: "NetworkDivision") -> int:
-        """Count the vehicles that changed since the division `before`.
+        """Return the number of vehicles that changed since the division `before`.
 
-        A vehicle changed if it was lost or replaced, or if it reaches other vehicles than before. Only vehicles that
-        live in both divisions are considered as reached vehicles.
+        A vehicle changed if it was lost or replaced, or if it reaches other vehicles than before. For this comparison,
+        only vehicles that live in both divisions count as reached.
         """
         both = self.living & before.living
         moved = sum(self.reachable_from(vehicle) & both != before.reachable_from(vehicle) & both for vehicle in both)

@@ -20,7 +20,7 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError
 ROOT = Path(__file__).parents[2]
 """The directory that contains the code of the running harness."""
 GRACE_S = 30.0
-"""Maximum number of seconds until a run stops after SIGTERM. The run first removes its network."""
+"""Maximum number of seconds that a run may take to stop after SIGTERM. It needs them to remove its network."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class ProcessResult:
         return lines[-1].removeprefix("ucp-harness: ")[:300] if lines else "it printed nothing"
 
     def raised_in(self, directory: Path) -> str | None:
-        """Return the exception that ended the process, with the innermost line of its traceback in `directory`.
+        """Return the exception that ended the process, with the last line of its traceback that is in `directory`.
 
         Return None if no line of the traceback is in this directory.
         """
@@ -199,7 +199,9 @@ class GitBisection:
         self._git(self.tree, "clean", "--quiet", "-xffd")
 
     def between(self, good: str, bad: str) -> int:
-        """Return the number of commits after the commit `good`, up to and including the commit `bad`."""
+        """Return the number of commits that the search must consider: those after the commit `good`, up to and
+        including the commit `bad`.
+        """
         return int(self._git(self.tree, "rev-list", "--count", f"{good}..{bad}"))
 
     def begin(self, good: str, bad: str) -> "str | SuspectCommits":

@@ -35,8 +35,8 @@ R = TypeVar("R")
 REDRAW_EVERY_S = 0.1
 LINE_EVERY_S = 10.0
 WAKE_EVERY_S = 1.0
-"""Maximum delay in seconds until the parent process handles a signal that arrives just before the process begins to
-wait.
+"""Maximum number of seconds that the parent process waits without checking for signals. A signal that arrives just
+before the wait would otherwise be handled only after the wait.
 """
 
 _FORK = multiprocessing.get_context("fork")
@@ -82,8 +82,8 @@ def sweep(
 
 
 def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError:
-    """Call `work` with one task in a worker process, and return the result or the error. The parent process passes this
-    value to `raise_error`.
+    """Call `work` with one task in a worker process, and return the result or the error. The parent process passes the
+    returned value to `raise_error`.
     """
     try:
         return work(task)
@@ -96,7 +96,7 @@ def outcome_of(work: Callable[[T], R], task: T) -> R | FailedTask | HarnessError
 
 
 def raise_error(outcome: R | HarnessError) -> R:
-    """Return the outcome of a task, or raise it if it is an error."""
+    """Return the outcome of a task. If it is an error that concerns every task, raise it instead."""
     if isinstance(outcome, HarnessError):
         raise outcome
     return outcome

@@ -111,7 +111,9 @@ def check_determinism(scenario: Scenario, seed: int) -> None:
 
 
 def run_to_end(story: Coroutine[Any, Any, Returned]) -> Returned:
-    """Run a coroutine without an event loop. The coroutine must never wait. In virtual time, a mission never waits."""
+    """Run a coroutine without an event loop. The coroutine must never wait, which is true for a mission in virtual
+    time.
+    """
     try:
         story.send(None)
     except StopIteration as end:
@@ -220,7 +222,9 @@ def simulated(scenario: Scenario, seed: int) -> Result:
 
 
 def _judge_failures(failures: Sequence[AgentFailedError]) -> Judgement:
-    """Return the verdict on agents that crashed or hung, if their end is not already a deviation of a handler."""
+    """Return the verdict on agents that crashed or hung. A crash in a handler does not count, because it already counts
+    as a deviation of this handler.
+    """
     reason = "; ".join(f"agent {error.agent_id} {error.outcome}" for error in failures)
     findings = [Finding(error.agent_id, f"{error.outcome}: it {error.detail}") for error in failures]
     return Judgement(RUN_CHECKS[ENDED], "violated", reason, findings)

@@ -234,8 +234,8 @@ def _speedup(headers: Mapping[int, TraceHeader], record: RunRecord) -> float:
 
 
 def _start_ns(record: RunRecord) -> int:
-    """Return the time at which the run started, in nanoseconds since the Unix epoch. This time is used as an estimate
-    of the time at which the mission started. Return 0 in virtual time.
+    """Return the time at which the run started, in nanoseconds since the Unix epoch. It stands in for an unknown start
+    of the mission. Return 0 in virtual time.
     """
     try:
         start = datetime.fromisoformat(record.started_at or "")

@@ -199,7 +199,7 @@ def _link(link: Link) -> str:
 
 
 def _whole(number: Any) -> int | None:
-    """Return the number if it is an integer that all tools show exactly. Return None otherwise."""
+    """Return the number if it is an integer that all tools show exactly. Return None for any other number."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 
 

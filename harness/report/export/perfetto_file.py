@@ -46,8 +46,8 @@ _LARGEST = 2**63 - 1
 _SEQUENCE = 1
 
 Event = tuple[int, int, Any]
-"""A packet of the trace with its sort key: time, rank, packet. The rank orders packets with the same time. Packets
-about the effects of a message have rank 1, so that a message is sent before it is received.
+"""A packet of the trace with its sort key: time, rank, packet. Of packets with the same time, those about effects of a
+message have the higher rank 1, so that a message is sent before it is received.
 """
 
 

@@ -196,7 +196,7 @@ class AgentActions:
         """If true, `read` processes only changes of the agent's state, which is several times as fast."""
         self._trace = AgentTrace(agents, agent_id)
         self._ahead: MessageReceipt | HandlerRun | DroppedDatagram | None = None
-        """An entry that was read but is later than the requested mission second."""
+        """An entry that was already read, but that is later than the mission second up to which the caller reads."""
         self._has_started = False
         self._held = HeldBlocks()
         self._completed: dict[str, int] = {}
@@ -276,7 +276,7 @@ class AgentActions:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Delete the state that was computed from the trace, because the agent restarted without it."""
+        """Forget the state of the agent, because it restarted without its disk."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False

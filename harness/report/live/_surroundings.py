@@ -38,7 +38,7 @@ class _TimedFile(Generic[TimedLine]):
         self._model: type[TimedLine] = model
         self._play: Callable[[TimedLine], None] = play
         self.ahead: TimedLine | None = None
-        """An entry that was read but is later than the requested mission second."""
+        """An entry that was already read, but that is later than the mission second up to which the caller reads."""
         self.at_s = 0.0
         """Mission second of the last entry that was processed."""
         self.problems: dict[str, None] = {}

@@ -55,12 +55,11 @@ not count.
 """
 LINES_AT_ONCE_LATE = 50
 POLLS_UNTIL_REPORTED = 2
-"""Number of polls between the poll that first finds a message in a trace and the poll that shows it on the page. After
-this time, most receivers have recorded the message. A receiver on a busy machine may record the message later. The page
-then gets a change of the kind `h`.
+"""Number of polls for which a message waits before the page shows it. After this time, most receivers have recorded the
+message. If a receiver on a busy machine records it later, the page gets a change of the kind `h`.
 """
 MAX_BEHIND_S = 2.0
-"""If the stream of changes is behind an active run by more than this number of seconds (wall time), it omits messages
+"""Seconds of wall time. If the stream of changes is behind an active run by more than this time, it omits messages
 until it has caught up.
 """
 MAX_KEPT = 100_000
@@ -264,8 +263,8 @@ class ChangeFeed:
             changes.clear()
 
     def _messages(self, *, report_all: bool) -> Iterator[Change]:
-        """Yield the messages that had enough time to reach the traces of their receivers. If `report_all` is true,
-        yield all messages.
+        """Yield the messages whose receivers have probably recorded them by now. If `report_all` is true, yield all
+        messages.
         """
         happened: list[tuple[float, int, int, SentMessage | MessageReceipt]] = []
         for course in self._courses:

@@ -38,8 +38,8 @@ from harness.report.live.feed import ChangeFeed, RunClock
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""If a live reader is behind by more than this number of bytes, it skips frequent changes, such as messages and
-positions, to catch up.
+"""Number of bytes. A page that is behind an active run by more than this number skips frequent changes, such as
+messages and positions, to catch up.
 """
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')
 

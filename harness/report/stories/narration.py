@@ -22,8 +22,8 @@ from ucp.trace import HandlerRun, SentMessage
 from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
-"""Maximum number of mission seconds between a cause and an effect that belong to the same instant. A timer with this
-lateness still counts as punctual. On a slow machine, the lateness of timers in mission seconds grows with the speedup.
+"""Maximum number of mission seconds between a cause and its effect in the same instant. A timer that is late by at most
+this time counts as punctual. On a slow machine, the lateness of timers in mission seconds grows with the speedup.
 """
 
 
@@ -40,11 +40,9 @@ class AgentReaction:
     receivers: dict[int, set[int]] = field(default_factory=lambda: defaultdict(set))
     """The receivers of each message that the action sent, by the sequence number of the message."""
     at_s: float = 0.0
-    """Mission second of the first cause of this action. If timers expired late, this is the time at which the cause
-    would have happened without their delay.
-    """
+    """Mission second of the first cause of this action. If timers expired late, their lateness is subtracted."""
     distance: int = 0
-    """Number of messages between this action and the first cause at the same instant."""
+    """Number of messages on the way from the first cause in the same instant to this action."""
 
     @property
     def instant(self) -> int:
@@ -123,11 +121,10 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key for an action.
+        """Return a key for an action. The story describes the actions of one agent with equal keys together.
 
-        If actions of one agent have equal keys, they handle equal answers, and the story describes them together. The
-        reason is that equal answers arrive in random order and only the first one has an effect. The text must not
-        depend on this order.
+        Such actions handle equal answers. Equal answers arrive in random order, and only the first one has an effect.
+        The text must not depend on this order.
         """
         run = action.runs[0]
         if action.cause is None or action.answer is None:

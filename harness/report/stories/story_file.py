@@ -134,8 +134,8 @@ second apart, and a change of the network takes some milliseconds.
 
 @dataclass(frozen=True)
 class StorySection:
-    """The place in a story file at which the reactions of the agents are written. The place follows line `line`,
-    counted from 0. It contains the reactions from mission second `from_s` until `until_s`.
+    """The place in a story file at which the reactions of the agents are written, directly after line `line`, counted
+    from 0. The reactions are those from mission second `from_s` until `until_s`.
     """
 
     line: int
@@ -249,7 +249,7 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return an error message that names the line of a sentence, in place of the scenario entry that the sentence
+    """Return the error message with the line of the story's sentence, in place of the scenario key that the sentence
     created.
     """
     entry = _ENTRY.match(problem)
