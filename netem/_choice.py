@@ -17,10 +17,10 @@ def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] =
     """Install the first suitable engine that works on this machine. Return the engine, and a text with the reason for
     the choice.
 
-    If `preference` is None, the function tries tc netem first, because this engine supports more conditions. `needs`
-    lists the conditions other than loss and partition that the engine must support. The function installs each engine
-    to test it, because no other test shows whether the kernel supports the engine. Raises EngineError if no engine
-    works. The error has the reason for each engine.
+    `preference` is the only engine to try. If it is None, the function tries tc netem first, because this engine
+    supports more conditions. `needs` lists the conditions other than loss and partition that the engine must support.
+    The function installs each engine to test it, because no other test shows whether the kernel supports the engine.
+    Raises EngineError if no engine works. The error has the reason for each engine.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:

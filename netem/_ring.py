@@ -1,8 +1,10 @@
 """Capture all frames of one switch port, through a ring buffer that this process shares with the kernel (AF_PACKET,
-TPACKET_V3). The ring consists of blocks, which the kernel fills one after another. The kernel hands over a block when
-the block is full or 100 ms old. A reader that is late still finds all blocks that fit into the ring. The kernel counts
-the frames that crossed the port, and the frames that did not fit into the ring. The number of missing frames is
-therefore always known. See packet(7), and packet_mmap in the kernel's documentation.
+TPACKET_V3).
+
+The ring consists of blocks, which the kernel fills one after another. The kernel hands over a block when the block is
+full or 100 ms old. A reader that is late still finds all blocks that fit into the ring. The kernel counts the frames
+that crossed the port, and the frames that did not fit into the ring. The number of missing frames is therefore always
+known. See packet(7), and packet_mmap in the kernel's documentation.
 
 Frames that leave the port have passed netem and nftables, and reach the vehicle. Frames that enter the port have not
 passed netem and nftables yet. The kernel does not compute checksums of packets on veth pairs. It marks such packets,

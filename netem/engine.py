@@ -1,9 +1,13 @@
 """Define the interface of engines. An engine makes the kernel apply network conditions to packets, and reports the
-result. There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the
-kernel's counts of three kinds of packets: passed, lost, and dropped by a partition. The counts begin at 0 when the lab
-starts, and a change of conditions does not reset them. After each change, the engine reads the state of the kernel. A
-difference from the requested conditions is an error, and the previous conditions are restored. A packet that is already
-in a queue during a change arrives under the old conditions.
+result.
+
+There are two engines: `netem.tc` (tc-netem(8)) and `netem._nft` (nft(8)). For each receiver, both report the kernel's
+counts of three kinds of packets: passed, lost, and dropped by a partition. The counts begin at 0 when the lab starts,
+and a change of conditions does not reset them.
+
+After each change, the engine reads the state of the kernel. A difference from the requested conditions is an error, and
+the previous conditions are restored. A packet that is already in a queue during a change arrives under the old
+conditions.
 """
 
 from __future__ import annotations

@@ -1,15 +1,19 @@
-"""Estimate properties of a received stream of packets, with 99.9 % confidence intervals. Shares have Wilson intervals.
-Means and deviations have intervals of the normal distribution. Losses in bursts are not independent. A stream with such
-losses therefore counts as a smaller number of independent packets. The number depends on the correlation of the losses.
-Rate and limit are not random. Their intervals contain all values that are consistent with the arrival times.
+"""Estimate properties of a received stream of packets, with 99.9 % confidence intervals.
 
-Each measured time contains delays of the machine. They have two causes. The first cause is *transit*: even on a perfect
-link, a packet takes some time from the sender to the receiver. A reference vehicle with perfect links receives the same
-packets. The time of each packet to the reference vehicle is subtracted from the packet's measured delay. The second
-cause is *timers*: a delayed packet leaves when a timer of the kernel expires, and timers expire late. The sender sleeps
-between its packets, and records how late it wakes up. A measurement cannot separate the lateness of a timer from a
-delay. The upper limit of the recorded lateness is therefore subtracted from the lower limit of a delay. On a slow
-machine the intervals become wide, but a correct kernel is never reported as wrong.
+Shares have Wilson intervals. Means and deviations have intervals of the normal distribution. Losses in bursts are not
+independent, so a stream with such losses counts as a smaller number of independent packets. The number depends on the
+correlation of the losses. Rate and limit are not random. Their intervals contain all values that are consistent with
+the arrival times.
+
+Each measured time also contains delays of the machine, which have two causes:
+
+- *Transit*: even on a perfect link, a packet takes some time from the sender to the receiver. A reference vehicle with perfect
+  links receives the same packets. The time of each packet to the reference vehicle is subtracted from its measured delay.
+- *Timers*: a delayed packet leaves when a timer of the kernel expires, and timers expire late. The sender sleeps between its
+  packets, and records how late it wakes up. A measurement cannot separate the lateness of a timer from a delay, so the upper
+  limit of the recorded lateness is subtracted from the lower limit of a delay.
+
+On a slow machine the intervals become wide, but a correct kernel is never reported as wrong.
 """
 
 from __future__ import annotations

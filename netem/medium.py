@@ -44,7 +44,9 @@ _TABLE_SIZE = 4096
 
 
 class RandomDraws(Protocol):
-    """The random results of one broadcast. Receivers are numbered from 0 in the order of the vehicles."""
+    """The losses and delays of one broadcast at all receivers, drawn at random. Receivers are numbered from 0 in the
+    order of the vehicles.
+    """
 
     latest: float
     """Upper bound, in seconds, of the time from sending to the arrival of any copy."""
@@ -137,14 +139,16 @@ class _SenderLinks(Protocol):
     soonest_of_all: float
     latest: float
     certain: bool
-    """True if nothing is random: each receiver gets either one copy of each broadcast, or none."""
+    """True if no random number matters: each receiver certainly gets one copy of each broadcast, or certainly gets
+    none.
+    """
 
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 
 
 _Way = tuple[int, float, float]
-"""A link as three numbers: the draw below which a packet is lost, the least delay in seconds, and the additional delay
-in seconds per unit of the draw.
+"""A link as three numbers. A packet is lost if its random number is below the first one. Its delay in seconds is the
+second number, plus the third number multiplied by another random number.
 """
 
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
@@ -307,8 +311,8 @@ class _Link:
             self._last, self._departures = before._last, before._departures
 
     def enqueue(self, now: float, bits: int, draws: _Copy, second: _Copy | None = None) -> tuple[float, ...]:
-        """Send a packet at the time `now`. Return the delay in seconds of each copy that arrives. If `second` is given,
-        the packet is duplicated, and up to two copies arrive.
+        """Send a packet at the time `now`. Return the delay in seconds of each copy that arrives. If the random numbers
+        `second` are given, the packet is duplicated, so up to two copies arrive.
         """
         conditions = self.conditions
         loss, turn, corruption, reordering, latency = draws

@@ -70,7 +70,7 @@ class ReceivedBroadcast:
     vehicle: int
     at_ns: int
     frame: bytes
-    """The Ethernet frame behind its `virtio_net_hdr`."""
+    """The Ethernet frame. It follows a `virtio_net_hdr`, which the kernel adds."""
 
     def udp_data(self, port: int) -> bytes | None:
         """Return the data of an unfragmented IPv4 UDP datagram to this port. Return None for any other frame."""

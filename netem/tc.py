@@ -267,8 +267,8 @@ class NetemEngine(Engine):
 
 
 def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[frozenset[int]]:
-    """Divide senders into kinds. All senders of a kind have the same network conditions at every receiver. A sender on
-    a link with memory forms its own kind.
+    """Divide senders into kinds. All senders of a kind have the same network conditions at every receiver. On a link
+    with memory, earlier packets affect later ones, so each sender on such a link forms its own kind.
     """
     shared = (conditions.default, *conditions.receivers.values())
     own: dict[int, list[object]] = {vehicle: [] for vehicle in vehicles}

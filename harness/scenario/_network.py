@@ -277,11 +277,11 @@ class NetworkModel(StrictModel):
     delay: DelayTime = 0.0
     """Delay in mission seconds, 0 to 60, or a distribution of delays."""
     duplicate: Probability = 0.0
+    """Probability that a message arrives twice."""
+    reorder: Probability = 0.0
     """Probability that a message is sent without the delay and overtakes other messages. If it is above 0, a `delay` is
     required.
     """
-    reorder: Probability = 0.0
-    """Probability that a message is sent without the delay, and so overtakes others. Above 0 it needs a `delay`."""
     corrupt: Probability = 0.0
     """Probability that one bit of a message flips. The receiver drops a message with a flipped bit because of its
     checksum.

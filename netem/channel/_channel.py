@@ -181,8 +181,8 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
-        """Mark stations at which the powers of all frames together reach the detection level. Such a station senses the
-        channel as busy until the sum of the powers falls below this level.
+        """Mark stations at which all frames on the air together reach the detection level. Such a station senses the
+        channel as busy until the sum of the powers falls below the detection level.
 
         Return the frames that more stations sense from now on than before.
         """

@@ -145,7 +145,9 @@ class CarrierSense:
         self.next_due = min(self._due.values(), default=NEVER)
 
     def _counted(self, station: int, now: int) -> int:
-        """Subtract the slots that have passed from this station's number of slots. Return the remaining number."""
+        """Return the number of slots that this station still has to count down: its previous number minus the slots
+        that have passed.
+        """
         left = self._left[station]
         if left and now > self._from[station]:
             passed = (now - self._from[station]) // self._slot

@@ -28,8 +28,8 @@ from netem.channel._parameters import NANOSECONDS, Radio, nanoseconds
 from netem.radio import MIN_DISTANCE_M, Place
 
 STEP = 0.1
-"""Amount of time and movement after which the shadowing is drawn again, as a share of the time or distance in which the
-correlation falls to 1/e. The correlation of the new with the old shadowing is then exp(-STEP), about 0.9.
+"""Part of the correlation time and correlation distance after which the shadowing is drawn again. Over the whole time
+or distance, the correlation falls to 1/e. From one draw to the next, it falls to exp(-STEP), about 0.9.
 """
 
 _SILENT = -1_000_000
@@ -60,8 +60,8 @@ def _deviations(shadowing_db: float) -> list[int]:
 
 @dataclass(slots=True)
 class FrameReach:
-    """The reception of one sender's frames at all receivers. A set of receivers has one bit per receiver. Receiver 0 is
-    the lowest bit.
+    """The reception of one sender's frames at all receivers. A set of receivers is an integer with one bit per
+    receiver. Receiver 0 is the lowest bit.
     """
 
     levels: list[int]
@@ -217,8 +217,9 @@ class RadioLinks:
         self._shift(elapsed_s / self._radio.shadowing_s)
 
     def _shift(self, exponent: float | None) -> None:
-        """Replace the random shadowing values. Each new value keeps a part of the old value: exp(-`exponent`) without
-        movement, and less with movement. If `exponent` is None, the new values do not depend on the old ones.
+        """Draw new shadowing values in dependence on the old ones. The correlation of new and old values is
+        exp(-`exponent`) if no vehicle has moved, and smaller after movements. If `exponent` is None, the new values do
+        not depend on the old ones.
         """
         shadow, moved_m = self._shadow, self._moved_m
         known = -1.0

@@ -27,7 +27,7 @@ ARROW = "M-4-5l9 5-9 5z"
 DIAMOND = "M0-6l6 6-6 6-6-6z"
 SQUARE = "M-5-5h10v10h-10z"
 BAR = "M0-6v12"
-"""Marks for the timeline of the report, each as an SVG path around the origin."""
+"""A mark for the timeline of the report: an SVG path around the origin."""
 
 
 class AgentOperations(Protocol):
