@@ -7,11 +7,12 @@ the arrival times.
 
 Each measured time also contains delays of the machine, which have two causes:
 
-- *Transit*: even on a perfect link, a packet takes some time from the sender to the receiver. A reference vehicle with perfect
-  links receives the same packets. The time of each packet to the reference vehicle is subtracted from its measured delay.
-- *Timers*: a delayed packet leaves when a timer of the kernel expires, and timers expire late. The sender sleeps between its
-  packets, and records how late it wakes up. A measurement cannot separate the lateness of a timer from a delay, so the upper
-  limit of the recorded lateness is subtracted from the lower limit of a delay.
+- *Transit*: even on a perfect link, a packet takes some time from the sender to the receiver. A reference vehicle with
+  perfect links receives the same packets. The time of each packet to the reference vehicle is subtracted from its
+  measured delay.
+- *Timers*: a delayed packet leaves when a timer of the kernel expires, and timers expire late. The sender sleeps
+  between its packets, and records how late it wakes up. A measurement cannot separate the lateness of a timer from a
+  delay, so the upper limit of the recorded lateness is subtracted from the lower limit of a delay.
 
 On a slow machine the intervals become wide, but a correct kernel is never reported as wrong.
 """

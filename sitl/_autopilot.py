@@ -39,7 +39,7 @@ ACCEPTED, FAILED = int(mavlink.MAV_RESULT_ACCEPTED), int(mavlink.MAV_RESULT_FAIL
 
 
 class MessageListener(Protocol):
-    """An object that receives the messages that the vehicle sends without a request."""
+    """An object that receives each message that the vehicle sends without a request, such as a text message."""
 
     def send(self, message: Any) -> None: ...
 
@@ -280,11 +280,11 @@ class Autopilot:
     # Movements
 
     def _begin(self, segments: Sequence[MotionSegment], then: Callable[[], None]) -> None:
-        """Begin a movement, and call `then` at its end."""
+        """Begin a movement. At its end, the autopilot calls `then`."""
         self._course, self._then, self._goal = PlannedMotion(self.now_s, segments), then, None
 
     def _act(self) -> None:
-        """Begin the movement of the current flight mode. The vehicle must be armed."""
+        """Begin the movement that the current flight mode requires. The vehicle must be armed."""
         self._in_mission = False
         match self.mode:
             case "AUTO" if self.airborne or self.vehicle_type != "copter":

@@ -85,7 +85,7 @@ class Failsafes:
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
-        """Failsafes that have acted and whose cause still exists."""
+        """Failsafes that have acted, and whose cause still exists, so that they do not act again."""
         self._since_s: dict[Failsafe, float] = {}
         """Failsafe -> the time at which its cause began. Only failsafes that have not acted yet are included."""
 

@@ -16,7 +16,7 @@ from sitl._pilot_link import PilotLink
 from sitl.procedure import HEARTBEAT, ProcedureStep
 
 PATIENCE = 10
-"""Number of heartbeats after which the pilot gives up a request without an answer."""
+"""Number of heartbeats of the vehicle without an answer, after which the pilot gives up a request."""
 MOST_AT_ONCE = 50
 
 _VERSION = ProcedureStep("its version")

@@ -47,11 +47,13 @@ class MotionModel(Protocol):
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": CopterMotion(), "plane": PlaneMotion(), "rover": RoverMotion()}
-"""Motion in missions, in AUTO mode."""
+"""Type of vehicle -> its motion when it flies a mission in AUTO mode."""
 
 AT_ONCE: dict[VehicleType, MotionModel] = {
     "copter": CopterMotion(turning_s=1.2, settling_s=0.0),
     "plane": PlaneMotion(),
     "rover": RoverMotion(start_s=0.0, corner_rads=TURN_RATE_RADS),
 }
-"""Motion outside of missions: in GUIDED mode, and during a commanded landing."""
+"""Type of vehicle -> its motion outside of missions: in GUIDED mode, and during a commanded landing. It reacts to
+commands without the delays that smooth a path in AUTO mode.
+"""

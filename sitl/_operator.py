@@ -13,11 +13,13 @@ MOST_COMMANDS = 1000
 """Maximum number of recorded commands. Further commands are only counted."""
 
 _ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
-"""Names of commands that only request an answer from a vehicle. Ground stations send them automatically."""
+"""Matches names of commands that only request data from a vehicle. Ground stations send them automatically, so they are
+not recorded.
+"""
 
 _AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
-"""Names of messages that a ground station sends many times per second. Consecutive messages of the same name form one
-entry.
+"""Names of messages with which an operator steers by joystick. A ground station sends them many times per second, so
+consecutive messages of the same name form one entry.
 """
 
 _COMMANDS = frozenset(

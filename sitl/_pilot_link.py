@@ -160,7 +160,7 @@ class PilotLink(asyncio.Protocol):
         self.send(mavlink.MAVLink_command_long_message(self.sysid, mavlink.MAV_COMP_ID_AUTOPILOT1, command, 0, *padded))
 
     def forget(self, command: int) -> None:
-        """Forget the answers of the vehicle to a command."""
+        """Forget earlier answers of the vehicle to a command, before the command is sent again."""
         self.acks.pop(command, None)
         self.accepted.discard(command)
 

@@ -70,8 +70,8 @@ def route(plan: Plan, vehicle_type: VehicleType, heading_deg: float) -> tuple[Wa
 
 
 def limit_s(waypoints: Sequence[Waypoint], index: int) -> float:
-    """Return the maximum number of simulated seconds from the completion of the previous waypoint to the completion of
-    this one.
+    """Return the time limit for a waypoint in simulated seconds, counted from the completion of the previous waypoint.
+    The limit allows for a slow flight.
     """
     waypoint = waypoints[index]
     start = waypoints[index - 1].place if index else LocalPlace(0.0, 0.0, 0.0)
@@ -95,7 +95,7 @@ def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> int | None:
     """Return the index of the waypoint at which a plane's landing begins. Return None if the route has no landing. A
-    plane's landing is always a mission.
+    plane always lands by a mission, even in a flight in GUIDED mode.
     """
     return len(waypoints) - 2 if vehicle_type == "plane" and waypoints[-1].kind == "land" else None
 

@@ -81,8 +81,8 @@ class GroundStation(asyncio.DatagramProtocol):
         self._vehicles[sysid] = vehicle
 
     def reach(self, sysid: int, *, reachable: bool) -> None:
-        """Start or stop forwarding between a vehicle and the ground station. Messages that arrive while forwarding is
-        stopped are lost.
+        """Start or stop forwarding between a vehicle and the ground station, as if their radio link were restored or
+        lost. Messages that arrive while forwarding is stopped are lost.
         """
         if reachable:
             self._out_of_reach.discard(sysid)

@@ -122,8 +122,8 @@ class Pilot:
     async def befall(self, circumstance: SimulatedFailure) -> Mapping[str, float]:
         """Make the vehicle simulate an event such as a GPS failure. Return the parameters that were set.
 
-        The vehicle may now act on its own. If it then leaves its mode, disarms, or misses a time limit, the current
-        procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the circumstance.
+        From now on, the vehicle may act on its own. If it then leaves its mode, disarms, or misses a time limit, the
+        current procedure ends without an error. Raises NotSimulatedError if the vehicle cannot simulate the event.
         """
         had_befallen, self._befallen = self._befallen, True  # the vehicle may act before it confirms a parameter
         try:
@@ -153,7 +153,7 @@ class Pilot:
         await self._pursue(_ListenOnlyProcedure())
 
     async def _pursue(self, procedure: PilotProcedure) -> None:
-        """Request each step of the procedure at every heartbeat until all steps are complete."""
+        """At each heartbeat, request the first incomplete step of the procedure, until all steps are complete."""
         clocks = _StepWaitingTimes(self.link)
         asked: tuple[ProcedureStep, int] | None = None
         while (step := self._next_step(procedure)) is not None:

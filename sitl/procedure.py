@@ -82,7 +82,7 @@ class ArmingPreparation:
 
 
 class Commander:
-    """The commands that all procedures share."""
+    """The commands to a vehicle that all procedures share, such as arming it."""
 
     def __init__(self, link: PilotLink, vehicle_type: VehicleType) -> None:
         self.link = link

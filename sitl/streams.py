@@ -31,8 +31,8 @@ SENSORS = (
     | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 )
 FENCE = mavlink.MAV_SYS_STATUS_GEOFENCE
-"""The fence sensor. The vehicle reports it as healthy even if no fence is set, as ArduPilot does. Otherwise MAVProxy
-would report a breach of the fence.
+"""The MAVLink flag of the fence. The vehicle reports the fence as healthy even if none is set, as ArduPilot does.
+Otherwise MAVProxy would report a breach of the fence.
 """
 NOT_YET = mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_AHRS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
 

@@ -25,7 +25,7 @@ ANSWERS = frozenset((BlockAddResponse, ChainContainResponse, NextInSequenceRespo
 """Messages that the agent delays. Algorithms 3, 9, 13 and 17 send them."""
 
 Outgoing = tuple[int, Message, RecordedBytes | None]
-"""An outgoing message: its sequence number, the message, and the datagram for the trace. The datagram is None if the
+"""An outgoing message: its sequence number, the message, and its datagram for the trace. The datagram is None if the
 agent writes no trace.
 """
 

@@ -22,7 +22,9 @@ LINE_BYTES = 80
 
 
 class DropQuota:
-    """Choose the dropped datagrams that the trace contains completely, and count the others."""
+    """A quota for dropped datagrams in a trace. Datagrams within the quota are written completely, and all others are
+    only counted.
+    """
 
     def __init__(self) -> None:
         self._left_bytes = float(QUOTA_BYTES)

@@ -4,7 +4,9 @@ from ucp.agent import Agent
 
 
 def status_of(agent: Agent) -> dict[str, object]:
-    """Return the part of the status that follows from the state of the agent. The caller adds all other values."""
+    """Return the values of the status that follow from the protocol state of the agent. The caller adds all other
+    values.
+    """
     state = agent.state
     return {
         "agent_id": agent.agent_id,

@@ -42,7 +42,7 @@ class Core(AgentState):
         self.outbox: list[tuple[int, Message, RecordedBytes | None]] = []
         """The messages to broadcast, as (sequence number, message, recorded datagram)."""
         self.changes: list[tuple[str, str]] = []
-        """The changes by the running handler, in the form of a trace line."""
+        """The changes of chain, deque and stack by the running handler, in the form of a trace line."""
         self.announced: list[SentMessage] = []
         """The messages that the running handler has sent, in the form of a trace line."""
         self.started: dict[str, float] = {}

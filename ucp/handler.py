@@ -21,7 +21,9 @@ LocalEvent = Literal[
     "Reconcile Phase 3",
     "Reconcile Finalize",
 ]
-"""A local event of an agent (the parallelograms of Figure 3.3), by its name in the thesis."""
+"""Name of a local event in the thesis. A local event triggers a handler of the same agent (the parallelograms of Figure
+3.3).
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,8 @@ class EventHandler(Generic[P]):
     starts: tuple[str, ...]
     triggers: tuple[LocalEvent, ...]
     tally: str | None = None
-    """Name of the state attribute that contains the counters or the choice of this handler. None if the handler has no
-    such attribute.
+    """Name of the attribute of `AgentState` in which this handler counts votes or answers, or stores the chosen block.
+    None for all other handlers.
     """
 
     @property

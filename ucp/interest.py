@@ -46,7 +46,9 @@ ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     ChainHashSuccessorQuery: lambda message, settings: (NextInSequenceResponse, message.chain_hash),
     RequestForBlock: lambda message, settings: (BlockResponse, message.block_hash),
 }
-"""Type of a query -> function that returns the open query of its sender from now on. Other messages open no query."""
+"""Type of a query -> function that returns the query as a `Question`. From now on, its sender waits for answers to it.
+Messages of other types are no queries.
+"""
 
 ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     BlockAddResponse: lambda message: (
@@ -58,7 +60,7 @@ ANSWERED: dict[type[Message], Callable[[Any], Question]] = {
     BlockResponse: lambda message: (BlockResponse, message.block.block_hash),
 }
 """Type of an answer -> function that returns the query to which the answer belongs. The answer has no effect on agents
-for which this query is not open.
+that do not wait for answers to this query.
 """
 
 STILL_ASKED: dict[type[Message], Callable[[AgentState], bool]] = {

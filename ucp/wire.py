@@ -22,7 +22,7 @@ class FieldKind(Enum):
     FLAG = "?"
     """One byte, 0 or 1."""
     BOOT = "16s"
-    """Number of the incarnation of a vehicle, in secured datagrams."""
+    """The value in secured datagrams that identifies a start of the sender."""
     HASH = "32s"
     OPTIONAL_HASH = "hash or nothing"
     """The last field of a message: either 32 bytes, or nothing."""

@@ -16,8 +16,8 @@ import math
 
 
 class TokenBudget:
-    """A budget of at most `burst` tokens. It gains `per_s` tokens each mission second. If `per_s` is infinite, there is
-    no limit.
+    """A limit for the rate of an expensive step. Each step takes a token. The budget holds at most `burst` tokens, and
+    gains `per_s` tokens each mission second. If `per_s` is infinite, there is no limit.
     """
 
     __slots__ = ("_burst", "_per_s", "_since_s", "_tokens")

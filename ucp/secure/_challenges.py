@@ -25,13 +25,15 @@ TRUST_DELAY_S = 2.0
 vehicles do not answer.
 """
 MAX_REMEMBERED_BOOTS = 256
-"""Maximum number of boots of one sender whose newest challenge a receiver remembers."""
+"""Maximum number of starts (boots) of one sender for which a receiver remembers the newest challenge."""
 ALL = 0
 """The target of a challenge that is sent to all vehicles."""
 
 
 class PendingChallenges:
-    """The challenge messages of one incarnation. The target of a challenge is an agent ID or `ALL`."""
+    """The challenges of one vehicle since its last start, to which it waits for echoes. The target of a challenge is an
+    agent ID or `ALL`.
+    """
 
     def __init__(self) -> None:
         self.first_at: float | None = None
@@ -41,7 +43,7 @@ class PendingChallenges:
         self._pending: dict[int, int] = {}
         """Agent to which a challenge was sent -> sequence number of the newest challenge to this agent."""
         self._closed: dict[int, int] = {}
-        """Sender -> least sequence number of a challenge. Echoes of this sender to earlier challenges do not count."""
+        """Sender -> smallest sequence number of a challenge to which its echoes still count."""
 
     @property
     def is_due(self) -> bool:
@@ -76,7 +78,7 @@ class PendingChallenges:
 
 
 class ReceivedChallenges:
-    """The newest challenge of each boot of one sender. The caller adds only authentic challenges."""
+    """The newest challenge of each start (boot) of one sender. The caller adds only authentic challenges."""
 
     def __init__(self) -> None:
         self._newest: dict[bytes, int] = {}

@@ -52,8 +52,8 @@ class EpochSecrets:
         self._previous_secret: bytes | None = None
         """The secret of the epoch before the clock's epoch. None if this incarnation never had it."""
         self._later: deque[bytes] = deque()
-        """The secrets of the epochs after the clock's epoch, in order. They are computed only when a datagram of such
-        an epoch arrives.
+        """The secrets of the epochs after the clock's epoch, in order. Each one is computed when a datagram of its
+        epoch arrives.
         """
         self._followed = 0
         self._started_s: float | None = None
@@ -91,8 +91,8 @@ class EpochSecrets:
         return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
     def follow(self, epoch: int) -> None:
-        """Send datagrams in this epoch or in a later one. Another vehicle with the group secret has already sent in
-        this epoch.
+        """Send datagrams at least in this epoch from now on, because another vehicle with the group secret sends in it.
+        The limit is `MAX_EPOCHS_FOLLOWED` epochs ahead of the own clock.
         """
         self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
 
@@ -114,11 +114,13 @@ class EpochSecrets:
         return abs(epoch - self._bundle.epoch) <= 1 or abs(epoch - self.current) <= 1
 
     def cached_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys | None:
-        """Return the cached keys with which this sender encrypts in its incarnation `boot`. None if there are none."""
+        """Return the cached keys with which this sender encrypts since its start `boot`. Return None if no keys are
+        cached.
+        """
         return self._sender_keys.get((epoch, sender, boot))
 
     def derive_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys:
-        """Derive the keys with which this sender encrypts in its incarnation `boot`. `can_open(epoch)` must be true."""
+        """Derive the keys with which this sender encrypts since its start `boot`. `can_open(epoch)` must be true."""
         return self._derive_keys(self._secret(epoch), self._mission, epoch, sender, boot)
 
     def remember(self, epoch: int, sender: int, boot: bytes, keys: SenderKeys) -> None:

@@ -1,8 +1,12 @@
-"""The revocations that an agent knows. A revoked agent stays revoked. An agent therefore counts as revoked if any
-revocation lists it. The files of the authority may be lost, copied or used in any order. A revocation with a higher
-number may therefore omit agents that an earlier revocation lists. An agent therefore keeps each revocation that lists a
-further agent. Each datagram contains a digest of all agents that its sender knows to be revoked. An agent whose own
-digest differs broadcasts its revocations.
+"""The revocations that an agent knows. A revocation is a list of agents whose keys are no longer valid, signed by the
+authority of the mission.
+
+A revoked agent stays revoked: an agent counts as revoked if any known revocation lists it. The files of the authority
+may be lost, copied or used in any order, so a revocation with a higher number may omit agents that an earlier one
+lists. An agent therefore keeps each revocation that lists a further agent.
+
+Each datagram contains a digest of all agents that its sender knows to be revoked. An agent whose own digest differs
+broadcasts its revocations.
 """
 
 from collections.abc import Iterable

@@ -40,7 +40,9 @@ REVOCATION = 10
 CHALLENGE, ECHO = 11, 12
 """Types of the datagrams with which a sender proves that it is active now. `ucp.secure._challenges` explains them."""
 CONTROL_POSITION = 2**32
-"""Lowest position of a control datagram. Control datagrams have a type from 10 on. Messages have lower positions."""
+"""Smallest nonce position of a control datagram. Control datagrams have types from 10 on, and contain no message of the
+protocol. Messages have smaller positions.
+"""
 TYPES = frozenset(range(1, ECHO + 1))
 
 CONTROL_NAMES = {REVOCATION: "Revocation", CHALLENGE: "Challenge", ECHO: "Echo"}
@@ -72,7 +74,9 @@ class ClearHeader(NamedTuple):
 
     @property
     def position(self) -> int:
-        """The number that selects the nonce. Messages and control datagrams have separate number ranges."""
+        """The number of the datagram from which its nonce follows. Messages and control datagrams have separate ranges
+        of numbers.
+        """
         return self.sequence if self.type < REVOCATION else CONTROL_POSITION + self.sequence
 
     def pack(self, length: int) -> bytes:

@@ -18,7 +18,7 @@ EPOCHS_AHEAD = 4096
 
 
 class DatagramOpener:
-    """Opens datagrams of all vehicles of a mission with the bundle of one vehicle.
+    """A reader that decrypts the datagrams of all vehicles of a mission with the bundle (the key file) of one vehicle.
 
     It opens datagrams of the bundle's epoch and of later epochs. Secrets of earlier epochs cannot be computed.
     """

@@ -28,7 +28,9 @@ _DATAGRAM = b"UCP datagram\0"
 
 
 class AnsweredRequest(NamedTuple):
-    """The request that a response answers, identified by its sender, boot and sequence number."""
+    """The request that a response answers. It is identified by its sender, the sender's start (`boot`), and its
+    sequence number.
+    """
 
     sender: int
     boot: bytes

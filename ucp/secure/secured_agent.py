@@ -40,7 +40,9 @@ class OutgoingDatagram(NamedTuple):
 
 
 def make_boot(started_us: int, random_bytes: bytes) -> bytes:
-    """Return the boot value of a new incarnation: its start time in microseconds UTC, and 8 random bytes."""
+    """Return the value that identifies a start of an agent in its datagrams: the start time in microseconds UTC, and 8
+    random bytes.
+    """
     boot = _BOOT_TIME.pack(started_us) + random_bytes
     assert len(boot) == BOOT_BYTES
     return boot
@@ -65,7 +67,7 @@ class SecuredAgent(Agent):
         """The reason why the agent has stopped sending. None while it sends."""
         self._signatures = BlockSignatures(session, self.state)
         self._answered_requests: dict[int, AnsweredRequest] = {}
-        """Sequence number of a response in the outbox -> the request that the response answers."""
+        """Sequence number of a response that waits to be sent -> the request that it answers."""
         self._exports = 0
         self._now = 0.0
         """Mission second of the last datagram or revocation that the agent received."""

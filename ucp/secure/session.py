@@ -51,30 +51,32 @@ a tenth of a processor core.
 REVOCATIONS_PER_S = 50.0
 """Maximum number of wrong signatures of the authority that a receiver verifies per mission second."""
 WRONG_SIGNATURES_AT_ONCE = 32
-"""Maximum number of tokens of a budget for wrong signatures."""
+"""Maximum number of wrong signatures in one sender's name that a receiver verifies in a row."""
 UNKNOWN_BOOTS_PER_S = 5000.0
-"""Maximum number of datagrams of unknown boots per mission second whose keys a receiver derives. A radio with 6 Mbit/s
-carries fewer datagrams. The derivation takes a twentieth of a processor core.
+"""Maximum number of datagrams per mission second from unknown starts (boots) of senders for which a receiver derives
+keys. A radio with 6 Mbit/s carries fewer datagrams. The derivation takes a twentieth of a processor core.
 """
 UNKNOWN_BOOTS_AT_ONCE = 1000
-"""Maximum number of tokens of the budget for unknown boots."""
+"""Maximum number of keys for unknown starts (boots) that a receiver derives in a row."""
 
 
 class _SenderIncarnation:
-    """The newest known incarnation of another sender, with its accepted sequence numbers and its newest requests."""
+    """The last known start of another sender, with the sequence numbers that were accepted since then, and the newest
+    requests.
+    """
 
     __slots__ = ("boot", "latest_boot", "requests", "window")
 
     def __init__(self, boot: bytes, first: int = 0, latest_boot: bytes = b"") -> None:
         self.boot = boot
         self.latest_boot = max(boot, latest_boot)
-        """The greatest boot of this sender so far. It is greater than `boot` if the sender lost its clock."""
+        """The latest start (boot) of this sender so far. It is later than `boot` if the sender has lost its clock."""
         self.window = ReplayWindow(first)
         self.requests: dict[int, int] = {}
         """Type of a request -> sequence of the newest request of this type that was received."""
 
     def is_later(self, boot: bytes) -> bool:
-        """Return whether an incarnation with this boot is later than all known incarnations of the sender."""
+        """Return whether a start with this `boot` is later than all known starts of the sender."""
         return boot > self.latest_boot
 
 
@@ -108,11 +110,13 @@ class Session:
         self.epochs = EpochSecrets(started, save_bundle, crypto.sender_keys)
         self.challenges = PendingChallenges()
         self._is_complete: bool | None = None
-        """True if the replay windows cover the whole mission, because no earlier incarnation used the bundle. None
-        before the start.
+        """True if this vehicle has listened since the beginning of the mission, because no earlier start used the
+        bundle. Its replay windows then cover the whole mission, so it recognises every repeated datagram. None before
+        the start.
         """
         self._held: dict[int, _SenderIncarnation] = {}
-        """Sender -> its incarnation. These senders have answered a challenge, but this vehicle does not trust them yet.
+        """Sender -> its last known start. These senders have answered a challenge, but this vehicle does not trust them
+        yet, because it still collects answers.
         """
         self._challenged_by = {agent_id: ReceivedChallenges() for agent_id in self.public_keys}
         self._echoes: list[AnsweredRequest] = []
@@ -259,8 +263,8 @@ class Session:
         return decrypted(self._keys_of(clear, now), datagram, clear)
 
     def _accept_boot(self, clear: ClearHeader) -> _SenderIncarnation:
-        """Accept the boot of the sender, which is later than all boots of this sender that the vehicle knows. Echoes of
-        older challenges no longer count.
+        """Accept a new start of the sender, which is later than all known ones. Echoes of older challenges no longer
+        count.
         """
         self.challenges.close(clear.sender, self._control)
         incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)

@@ -24,7 +24,7 @@ _CANNOT_FLY = frozenset({10, 11})  # MAV_TYPE_GROUND_ROVER, MAV_TYPE_SURFACE_BOA
 
 
 class TelemetryEvents:
-    """Converts the MAVLink byte stream of one vehicle to events.
+    """A converter from the MAVLink byte stream of one vehicle to events.
 
     `garbage` counts the unreadable parts of the stream.
     """
