@@ -153,7 +153,7 @@ class Pilot:
         await self._pursue(_ListenOnlyProcedure())
 
     async def _pursue(self, procedure: PilotProcedure) -> None:
-        """At each heartbeat, request the first incomplete step of the procedure, until all steps are complete."""
+        """Request the first incomplete step of the procedure at each heartbeat, until all steps are complete."""
         clocks = _StepWaitingTimes(self.link)
         asked: tuple[ProcedureStep, int] | None = None
         while (step := self._next_step(procedure)) is not None:

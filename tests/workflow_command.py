@@ -1,4 +1,4 @@
-"""Run `ucp-harness` in the tests of workflows without the work that takes long.
+"""Run `ucp-harness` in the tests of workflows, but without the parts that take long.
 
 The commands `conformance` and `doctor` only parse their options, and a random search plays only two runs.
 """

@@ -9,8 +9,8 @@ from tests.fuzz.targets import Target
 
 
 def executed(target: Target, data: bytes) -> None:
-    """Run the target with the input. Raises FailedError if the run exceeds a limit, and all exceptions of the
-    target.
+    """Run the target with the input. Raises FailedError if the run exceeds a limit. An exception of the target is
+    raised, too.
     """
     with bounded():
         target.run(data)

@@ -52,9 +52,8 @@ def _keep(name: str, flown: Path) -> list[bytes]:
 
 
 def _best(ways: dict[bytes, frozenset[Way]]) -> Iterator[bytes]:
-    """Yield the inputs to keep, within the limits.
-
-    Each is the input that covers the most pairs of lines that no earlier one covers.
+    """Yield the inputs to keep, within the limits. Each next input is the one that covers the most pairs of lines not
+    covered by the previous ones.
     """
     covered: set[Way] = set()
     left = MOST_BYTES

@@ -37,7 +37,7 @@ SEEDS = range(1, 6)
 
 
 @dataclass
-class Heard:
+class PacketsAtReceiver:
     """The numbered packets that were sent, and their copies that a receiver received."""
 
     sent_at: list[float]
@@ -60,13 +60,13 @@ class Heard:
 
 
 @dataclass
-class Both:
-    """The packets of a receiver with real packets, and in virtual time with several seeds."""
+class PacketsInBothNetworks:
+    """The packets of one receiver in two networks: real packets, and simulated packets with several seeds."""
 
-    kernel: Heard
-    medium: list[Heard]
+    kernel: PacketsAtReceiver
+    medium: list[PacketsAtReceiver]
     late_s: float
-    """Assumed delay of this machine in seconds. It is the largest measured delay, but not less than LATE_S."""
+    """Assumed delay of this machine in seconds: the largest measured delay, but at least LATE_S."""
 
     def agree_on_copies(self) -> None:
         """Check that the numbers of packets with no, one and two copies agree."""
@@ -97,19 +97,19 @@ class Both:
         assert all(-EARLY_S < late_s < self.late_in_queue_s for late_s in later), later
 
     @property
-    def sides(self) -> tuple[Heard, Heard]:
+    def sides(self) -> tuple[PacketsAtReceiver, PacketsAtReceiver]:
         return self.kernel, self.pooled
 
     @property
-    def pooled(self) -> Heard:
+    def pooled(self) -> PacketsAtReceiver:
         """Return the packets of all seeds in virtual time."""
         sent_at = [at for one in self.medium for at in one.sent_at]
-        return Heard(sent_at, [copies for one in self.medium for copies in one.delays])
+        return PacketsAtReceiver(sent_at, [copies for one in self.medium for copies in one.delays])
 
 
 async def broadcast(
     air: Air, conditions: NetworkConditions, sender: int, receivers: Iterable[int], at_once: int = PACKETS
-) -> dict[int, Both]:
+) -> dict[int, PacketsInBothNetworks]:
     """Send packets as fast as `sender` can, and return the packets at each receiver.
 
     `at_once` is the number of packets before each pause. With many receivers and no pauses, a kernel may drop packets.
@@ -131,20 +131,23 @@ async def broadcast(
         delays: list[list[float]] = [[] for _ in sent_at]
         for number, delay_s in zip(found[receiver]["numbers"], found[receiver]["delays_s"], strict=True):
             delays[number].append(delay_s)
-        in_kernel[receiver] = Heard(sent_at, delays)
+        in_kernel[receiver] = PacketsAtReceiver(sent_at, delays)
     vehicles = air.lab.vehicles
     in_medium = [through_medium(vehicles, seed, conditions, vehicles.index(sender), sent_at) for seed in SEEDS]
     late_s = max(LATE_S, max(witness["delays_s"]) - CONSTANT_S)
-    return {v: Both(in_kernel[v], [flown[vehicles.index(v)] for flown in in_medium], late_s) for v in receivers}
+    return {
+        v: PacketsInBothNetworks(in_kernel[v], [flown[vehicles.index(v)] for flown in in_medium], late_s)
+        for v in receivers
+    }
 
 
 def through_medium(
     vehicles: Sequence[int], seed: int, conditions: NetworkConditions, sender: int, sent_at: list[float]
-) -> list[Heard]:
+) -> list[PacketsAtReceiver]:
     """Return the simulated packets at each vehicle. `sender` is an index in `vehicles`."""
     medium = Medium(vehicles, seed)
     medium.apply(conditions)
-    flown = [Heard(sent_at, [[] for _ in sent_at]) for _ in vehicles]
+    flown = [PacketsAtReceiver(sent_at, [[] for _ in sent_at]) for _ in vehicles]
     for number, at in enumerate(sent_at):
         for receiver, delay in medium.draw(sender, at, DATA_BYTES).to_all():
             flown[receiver].delays[number].append(delay)
@@ -250,7 +253,7 @@ def test_rates_and_limits_agree(netem: str, tmp_path: Path) -> None:
     in_lab([1, *links], netem, tmp_path, story)
 
 
-def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
+def assert_jitter_keeps_order(both: PacketsInBothNetworks, spread_s: float) -> None:
     """Check that, with a limited data rate, random delays neither change the order of packets nor add up."""
     heard = [one.arrivals for one in (both.kernel, *both.medium)]
     assert all(map(in_order, heard))
@@ -258,7 +261,7 @@ def assert_jitter_keeps_order(both: Both, spread_s: float) -> None:
     assert max(ends) - min(ends) < spread_s, ends
 
 
-def assert_overtakers_take_no_time(both: Both, each_s: float) -> None:
+def assert_overtakers_take_no_time(both: PacketsInBothNetworks, each_s: float) -> None:
     """Check that, with a limited data rate, reordered packets are not delayed and the other packets keep their
     order.
     """

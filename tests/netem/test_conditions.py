@@ -189,7 +189,7 @@ def test_engine_refuses_unsupported_conditions_before_any_change(conditions: Net
         engine.apply(conditions)
 
 
-class _Forgetful(Engine):
+class _ForgetfulEngine(Engine):
     """An engine that fails to apply the conditions in `refused`. If `stuck` is true, it keeps the first conditions
     forever.
     """
@@ -212,7 +212,7 @@ class _Forgetful(Engine):
 
 
 def test_refused_change_is_undone_and_reported() -> None:
-    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine = _ForgetfulEngine(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
     with pytest.raises(
         EngineError,
@@ -223,7 +223,7 @@ def test_refused_change_is_undone_and_reported() -> None:
 
 
 def test_failed_undo_is_reported_with_the_conditions_in_force() -> None:
-    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine = _ForgetfulEngine(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.apply(NetworkConditions(LinkConditions(0.1)))
     engine.stuck = True
     word = (
@@ -251,7 +251,7 @@ def test_failed_undo_is_reported_with_the_conditions_in_force() -> None:
 def test_state_of_the_kernel_is_compared_within_the_resolution(
     asked: LinkConditions, held: LinkConditions, differing: str | None
 ) -> None:
-    engine = _Forgetful(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
+    engine = _ForgetfulEngine(SimpleNamespace(vehicles=(1, 2, 3)))  # type: ignore[arg-type]
     engine.stuck = True
     engine._held = NetworkConditions(held)
     if differing is None:

@@ -14,7 +14,7 @@ from netem.errors import EngineError
 VEHICLES = range(1, 31)
 
 
-class Narrow(NftablesEngine):
+class NarrowEngine(NftablesEngine):
     """An nftables engine that accepts few commands in a transaction. After `lasts` transactions, it fails."""
 
     def __init__(self) -> None:
@@ -40,14 +40,14 @@ def every_link() -> NetworkConditions:
 
 
 def test_long_change_is_split_into_several_transactions() -> None:
-    engine = Narrow()
+    engine = NarrowEngine()
     engine.change(every_link())
     assert len(engine.sent) > 3
     assert sum(engine.sent) > 3000
 
 
 def test_undo_of_a_partial_change_sets_all_losses_again() -> None:
-    engine = Narrow()
+    engine = NarrowEngine()
     engine.lasts = 2
     with pytest.raises(EngineError, match="no more memory"):
         engine.change(every_link())

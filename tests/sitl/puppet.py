@@ -19,7 +19,9 @@ TURN_S = 0.005
 
 
 class Puppet:
-    """An embedded vehicle whose sent frames the function `tamper` may change. Simulated time runs at SPEEDUP."""
+    """An embedded vehicle. The function `tamper` may change each frame that it sends. Simulated time runs at
+    SPEEDUP.
+    """
 
     def __init__(self, vehicle_type: VehicleType, sock: socket.socket) -> None:
         self.vehicle = Autopilot(3, HOME, 0, vehicle_type)

@@ -41,7 +41,7 @@ RUNS = {
     "asking": {"network": {"loss": 0.25}, "settings": {"asks_after_commit": True}},
 }
 HELD_ALREADY = ("reconcile_phase_3", "Reconcile Finalize")
-"""An action that a handler declares for an agent whose mutual successor is already in its chain.
+"""An action that a handler takes only if the block after the mutual block is already in the agent's chain.
 
 Correct agents never reach this state.
 """
@@ -55,8 +55,8 @@ def traces(**keys: Any) -> Iterator[Trace]:
 
 
 def done(trace: Trace, handlers: dict[str, EventHandler[Any]]) -> Iterator[tuple[str, str]]:
-    """Yield what each handler in a trace does, as pairs of the handler and an action. Fail if an action is not
-    declared.
+    """Yield each action of each handler in a trace, as a pair of the handler and the action. Fail if the handler does
+    not declare the action.
 
     An action is the name of a sent message, of a started timer or of a triggered event.
     """

@@ -71,8 +71,8 @@ class _Program:
         return self._data[self._position - count : self._position]
 
 
-class _Driven:
-    """An agent that executes the operations, and the trace that it has written so far."""
+class _DrivenAgent:
+    """An agent to which the operations of an input are applied, and the trace that it has written so far."""
 
     def __init__(self, settings: Settings) -> None:
         self.now = 0.0
@@ -120,15 +120,15 @@ class _Driven:
         """
         sender = sender or 1 if sender < 6 else 2 + sender % 3
         matters = sender in ROSTER[1:] and MATTERS[type(message)](self.agent.state, sender, message)
-        before = None if matters else _of(self.agent)
+        before = None if matters else _comparable_state(self.agent)
         self.agent.receive_datagram(encode(sender, 5, message), self.now)
-        require(matters or _of(self.agent) == before, "what cannot matter changed the agent")
+        require(matters or _comparable_state(self.agent) == before, "what cannot matter changed the agent")
 
     def _receive(self, data: bytes) -> None:
-        dropped, before = self.agent.dropped.total(), _of(self.agent)
+        dropped, before = self.agent.dropped.total(), _comparable_state(self.agent)
         self.agent.receive_datagram(data, self.now)
         if self.agent.dropped.total() > dropped:
-            require(_of(self.agent) == before, "a datagram that was dropped changed the agent")
+            require(_comparable_state(self.agent) == before, "a datagram that was dropped changed the agent")
 
     def _message(self, kind: int, program: _Program) -> Message:
         chain_hash = self._chain_hash(program.byte())
@@ -160,7 +160,7 @@ class _Driven:
                 return BlockResponse(block)
 
     def _chain_hash(self, choice: int) -> bytes:
-        """Return the hash of a part of the agent's chain, or the hash of such a part with another block on top."""
+        """Return the hash of the agent's chain or of its beginning, alone or with another block on top."""
         chain = self.agent.state.chain
         hashes = [chain_hash for _, chain_hash in chain.with_chain_hashes()][::-1]
         hashes += [chain.inception.chain_hash, self.agent.state.top_chain_hash_at_initiation or bytes(32)]
@@ -218,7 +218,7 @@ class _Driven:
             )
 
 
-def _of(agent: Agent) -> bytes:
+def _comparable_state(agent: Agent) -> bytes:
     """Return all data of the agent that determine its later behaviour."""
     state = {name: value for name, value in vars(agent.state).items() if name not in ("now", "running", "changes")}
     return pickle.dumps({**state, "chain": vars(agent.state.chain)})
@@ -226,7 +226,7 @@ def _of(agent: Agent) -> bytes:
 
 def run(data: bytes) -> None:
     program = _Program(data)
-    driven = _Driven(SETTINGS[program.byte() % len(SETTINGS)])
+    driven = _DrivenAgent(SETTINGS[program.byte() % len(SETTINGS)])
     for _ in range(MOST_OPERATIONS):
         if program.over:
             break

@@ -76,8 +76,8 @@ class _Program:
         return self._data[self._position - count : self._position]
 
 
-class _Driven:
-    """The agent, and the last datagrams that other agents have sent to it."""
+class _DrivenAgent:
+    """The agent under test, and the last datagrams that other agents have sent to it."""
 
     def __init__(self, crypto: CryptoFunctions) -> None:
         self.now = 0.0
@@ -187,7 +187,7 @@ class _Driven:
         return clear + keys.encrypt(header.position, body, clear)
 
     def _receive(self, data: bytes) -> None:
-        agent, before = self.agent, _of(self.agent)
+        agent, before = self.agent, _comparable_state(self.agent)
         dropped, handled = agent.dropped.copy(), agent.received.total()
         trusted = {*agent.session._incarnations}
         epoch = agent.session.epochs.bundle.epoch
@@ -195,7 +195,7 @@ class _Driven:
         reasons = agent.dropped - dropped
         has_moved_on = agent.session.epochs.bundle.epoch != epoch or {*agent.session._incarnations} != trusted
         if reasons and set(reasons) <= BEFORE_ITS_SIGNATURE and not has_moved_on:
-            require(_of(agent) == before, f"dropped as {list(reasons)}, and the agent is another")
+            require(_comparable_state(agent) == before, f"dropped as {list(reasons)}, and the agent is another")
         if not reasons and agent.received.total() == handled:
             require(read_clear_header(data).type >= 10, "neither dropped nor handled")
         self.look()
@@ -237,17 +237,16 @@ class _Driven:
 
 
 def _is_accepted(session: Session, sealed_by: tuple[int, int, bytes]) -> bool:
-    """Return whether the session accepts this incarnation.
-
-    The session keeps the keys of such an incarnation before it has received an authentic datagram.
+    """Return whether the session already accepts datagrams from this start of the sender. It then keeps the keys of
+    this start.
     """
     _, sender, boot = sealed_by
     incarnation = session._incarnations.get(sender)
     return incarnation is not None and incarnation.boot == boot
 
 
-def _of(agent: SecuredAgent) -> dict[str, Any]:
-    """Return all data of the agent that a datagram might change."""
+def _comparable_state(agent: SecuredAgent) -> dict[str, Any]:
+    """Return all data of the agent that a datagram might change, for comparison."""
     state, session = agent.state, agent.session
     return {
         "received": agent.received.copy(),
@@ -265,13 +264,13 @@ def _of(agent: SecuredAgent) -> dict[str, Any]:
 
 
 def _driven(data: bytes, crypto: CryptoFunctions) -> tuple[object, ...]:
-    program, driven = _Program(data), _Driven(crypto)
+    program, driven = _Program(data), _DrivenAgent(crypto)
     for _ in range(MOST_OPERATIONS):
         if program.over:
             break
         driven.operate(program)
     agent = driven.agent
-    return _of(agent), agent.dropped, agent.session.epochs.current
+    return _comparable_state(agent), agent.dropped, agent.session.epochs.current
 
 
 def run(data: bytes) -> None:

@@ -1,5 +1,5 @@
-"""Test packed traces: large traces are packed during and after the run, all readers accept packed traces, and no reader
-judges a damaged one.
+"""Test compressed (packed) traces. Large traces are compressed during and after the run, all readers accept compressed
+traces, and no reader judges a damaged one.
 """
 
 import gzip
@@ -62,7 +62,7 @@ def test_run_packs_only_large_traces(plain: Path, tmp_path: Path, monkeypatch: p
 
 @pytest.fixture
 def partly_packed(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a run whose harness was killed. All but the end of each trace is packed."""
+    """Return a run whose harness was killed. Each trace is compressed except for its end."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 0)
     monkeypatch.setattr(bounded_file, "PART_BYTES", 65536)
     monkeypatch.setattr(bounded_file, "KEPT_BYTES", 1)
@@ -141,7 +141,9 @@ def test_traces_that_are_partly_packed_are_packed_completely(plain: Path, partly
 
 
 def test_agent_and_reader_notice_nothing_of_packed_parts(plain: Path, partly_packed: Path) -> None:
-    """Let the agent append lines between two packings. A reader that is open at the same time reads each line once."""
+    """Let the agent append lines between two compressions of its trace. A reader that is open at the same time reads
+    each line once.
+    """
     path, whole = partly_packed / "agents" / NAMES[0], (plain / "agents" / NAMES[0]).read_bytes()
     read = b""
     with open_trace(path) as early, path.open("ab", buffering=0) as agent:
@@ -171,7 +173,7 @@ def test_run_packs_its_traces_while_it_plays(tmp_path: Path, monkeypatch: pytest
 def test_programs_are_judged_alike_if_their_traces_are_packed_meanwhile(
     backend: BackendName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Restart an agent, so that the harness appends to a trace of which some parts are already packed."""
+    """Restart an agent, so that the harness appends to a trace of which some parts are already compressed."""
     monkeypatch.setattr(trace_files, "PACKED_FROM_BYTES", 1)
     monkeypatch.setattr(bounded_file, "PART_BYTES", 4096)
     monkeypatch.setattr(bounded_file, "KEPT_BYTES", 4096)

@@ -237,7 +237,7 @@ def test_handler_without_a_valid_trigger_violates_1(run_dir: Path, trigger: dict
 
 
 def hang(lines: list[dict]) -> None:
-    """Remove the ends of all votes from a trace."""
+    """Remove the ends of all votes from a trace, as if the agent waited forever."""
     lines[:] = [line for line in lines if line.get("handler") != "vote_timer_expiration"]
 
 

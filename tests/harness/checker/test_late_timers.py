@@ -61,8 +61,8 @@ def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(late: Path, tmp_path: Path, *, speedup: float = 1.0, lag: list[dict[str, Any]] | None = None) -> Judgement:
-    """Judge the steps as if mission time had this speedup, and as if the harness had measured these delays of the
-    machine.
+    """Judge the steps of a run. `speedup` replaces the speedup of mission time, and the delays of the machine replace
+    the measured ones.
     """
     directory = tmp_path / "run"
     if not directory.exists():

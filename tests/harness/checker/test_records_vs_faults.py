@@ -257,7 +257,9 @@ def honest(request: pytest.FixtureRequest) -> Evidence:
 
 
 def kept(trace: Trace, which: Iterator[bool]) -> Trace:
-    """Return the trace with only these received messages."""
+    """Return the trace without some of the received messages. For each received message in order, `which` states
+    whether it remains.
+    """
     runs = [run for run in trace.runs if not isinstance(run.trigger, MessageTrigger) or next(which)]
     return replace(trace, runs=runs)
 

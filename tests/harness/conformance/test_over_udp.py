@@ -73,9 +73,9 @@ def test_vectors_that_need_a_missing_feature_are_not_applicable(tmp_path: Path, 
     assert results.exit_status == 0 and "an unknown feature" in results.notes[0]
 
 
-async def _late(place: Path) -> tuple[TestedStep | None, bool, TestedStep | None]:
-    """Suspend an agent until its vote should have ended, and give it an input. After it continues, give it another
-    input.
+async def _steps_around_a_suspension(place: Path) -> tuple[TestedStep | None, bool, TestedStep | None]:
+    """Suspend an agent until its vote should have ended. Meanwhile, give it an input. After it continues, give it
+    another input.
 
     Return the result of the first input, whether the reference still follows the agent, and the result of the second
     input.
@@ -99,7 +99,7 @@ async def _resume(agent: UdpAgent, after_s: float) -> None:
 
 
 def test_reference_follows_an_agent_on_a_late_machine(tmp_path: Path) -> None:
-    late, reference_follows, then = asyncio.run(_late(tmp_path))
+    late, reference_follows, then = asyncio.run(_steps_around_a_suspension(tmp_path))
     assert late is not None and then is not None
     assert late.late or not late.wrong
     assert reference_follows and not then.wrong, (late.wrong, then.wrong)

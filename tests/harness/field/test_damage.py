@@ -377,7 +377,9 @@ def test_pause_may_begin_soon_after_the_expiry_of_a_timer(whole: tuple[Path, Und
 
 @pytest.mark.parametrize("number", [119, 139])
 def test_three_lost_lines_near_each_other_lead_to_no_accusation(number: int, tmp_path: Path) -> None:
-    """Flight 119 has a lost event whose block is on no record. Flight 139 has three lost answers within 8 lines."""
+    """Damage a trace in two ways that a random search found. In flight 119, an event is lost, and no record contains
+    the block with this event. In flight 139, three answers within 8 lines are lost.
+    """
     flight, home = field_damage.scenario(number, "sim"), tmp_path / "home"
     bring_home(flight, number, "sim", tmp_path / "run", home)
     name = "three lines cut out of each trace"

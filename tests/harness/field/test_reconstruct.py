@@ -46,7 +46,7 @@ FIELD: dict[str, Any] = {
 
 
 def field_records(directory: Path, run: Path, *left_out: str) -> Path:
-    """Copy the records of a run that a real flight would have, and no others."""
+    """Copy those records of a run that also exist after a real flight."""
     directory.mkdir()
     for path in (run / "agents").glob("*.json*"):
         if path.name not in left_out:

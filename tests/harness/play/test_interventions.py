@@ -26,8 +26,8 @@ pytestmark = pytest.mark.any_user
 
 
 def played(asked: Scenario, out: Path, do: Callable[[Interventions], None]) -> Run:
-    """Play a simulated run that is paused at mission second 0. The function `do` sends requests, and then time
-    continues.
+    """Play a simulated run that is paused at mission second 0. The function `do` sends requests of a user. Then the run
+    continues to its end.
     """
     interventions = Interventions(asked, virtual_time=True, paused=True)
     over = threading.Event()

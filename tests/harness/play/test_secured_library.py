@@ -1,4 +1,4 @@
-"""Test that all included scenarios give the same chains with and without keys."""
+"""Test that all included scenarios give the same chains with keys as without keys."""
 
 import sys
 from pathlib import Path

@@ -106,7 +106,8 @@ def random_message(lots: Random, agent: Agent, material: ForgeryMaterial) -> Mes
 
 
 def outcome(agent: Agent, message: Message, others: frozenset[PendingQuestions]) -> Any:
-    """Return the agent's state after a message, and those of its sent messages for which other agents wait.
+    """Return the agent's state after a message of the attacker, and the parts of its sent messages that matter to
+    waiting agents.
 
     New blocks have neutral names. The agent is then restored to its earlier state.
     """

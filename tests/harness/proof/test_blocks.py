@@ -1,4 +1,6 @@
-"""Test that states which differ only in the identity of blocks count as one state, if any block may be the oldest."""
+"""Test that two states count as one state if they differ only in the identity of blocks, and if any block may be the
+oldest.
+"""
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations
@@ -19,7 +21,7 @@ from tests.harness.proof.test_explore import Seen, all_seen, by_chance, explored
 
 
 def alike(seen: Seen) -> Seen:
-    """Return the same view for all views that differ only in the identity of agents and blocks."""
+    """Return one view to represent all views that differ only in the identity of agents and blocks."""
     return min(tuple(sorted(called)) for called in renumbered(seen))
 
 

@@ -46,7 +46,7 @@ def view_of(agent: Agent) -> View:
 
 
 def seen_of(agents: Sequence[Agent]) -> Seen:
-    """Return the visible states of agents in sorted order. Their IDs do not matter."""
+    """Return the visible states of agents in sorted order, so that their IDs make no difference."""
     return tuple(sorted(map(view_of, agents)))
 
 

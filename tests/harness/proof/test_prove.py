@@ -211,7 +211,9 @@ def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exceptions are ignored in functions that Python calls at a fork."""
+    """Press Ctrl-C while worker processes are forked. Python ignores exceptions in functions that it calls at a
+    fork.
+    """
     interruptions = [signal.SIGINT]
     os.register_at_fork(before=lambda: signal.raise_signal(interruptions.pop()) if interruptions else None)
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)

@@ -1,4 +1,4 @@
-"""Test agents with different timers. In such a swarm, the identity of agents matters."""
+"""Test agents whose timers have different durations. Such agents are not interchangeable."""
 
 from pathlib import Path
 from random import Random
@@ -20,7 +20,7 @@ PHASE_1: Stagger = {"phase1_timeout_s": 0.5}
 
 
 def whichever_block(graph: StateGraph) -> set[Seen]:
-    """Return the same view for all views that differ only in the identity of blocks."""
+    """Return one view to represent all views that differ only in the identity of blocks."""
     return {min(renumbered(seen)) for seen in by_place(graph)}
 
 

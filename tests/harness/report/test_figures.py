@@ -25,7 +25,9 @@ IN_NO_FIGURE = {
     "reconcile_phase_3": {"held already"},
     "reconcile_finalize": {"asked who follows"},
 }
-"""Branches that the harness adds for cases which the thesis does not cover."""
+"""Branches of handlers that no figure of the thesis shows. The harness adds them for cases that the thesis does not
+cover.
+"""
 
 
 def story_with_answers(story: Story, directory: Path, seed: int = 1) -> str:

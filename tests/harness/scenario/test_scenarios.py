@@ -23,7 +23,7 @@ SCENARIOS = Path(__file__).parents[3] / "scenarios"
 MATRIX = SCENARIOS / "thesis_matrix.yaml"
 SEEDS = (1, 2, 3)
 MAX_UNDECIDED_BLOCKS = 5
-"""Maximum number of blocks that are still undecided at the end of a mission of 20 minutes."""
+"""Maximum number of blocks on which no vote is decided yet at the end of a mission of 20 minutes."""
 
 
 @cache

@@ -59,7 +59,9 @@ def test_two_losses_livelock_a_staggered_swarm() -> None:
 
 
 def test_staggered_phase_1_alone_allows_a_livelock_in_resonance() -> None:
-    """Two phases 1 of one agent last as long as phases 1 and 3 of another agent, for any timer difference."""
+    """Set only the timers of phase 1 to different durations. Twice the phase 1 of one agent then takes as long as
+    phases 1 and 3 of another agent, for any difference of the timers.
+    """
     scenario = load_scenario(SCENARIOS / "in_resonance.yaml")
 
     def liveness(seed: int = 1, **changes: Any) -> str:

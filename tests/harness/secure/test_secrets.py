@@ -14,7 +14,9 @@ from tests.harness.secure.secrets import boots_in, forms, leaks, left_in, secret
 
 ROSTER = [1, 2, 3]
 EPOCHS = 14
-"""Number of epochs whose secrets are searched for. It includes later epochs to which a vehicle would follow others."""
+"""Number of epochs whose secrets the test searches for. An epoch is a period with its own group secret. Later epochs
+are included, because a vehicle may follow other vehicles to them.
+"""
 
 
 @pytest.fixture(scope="module")

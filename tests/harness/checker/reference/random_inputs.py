@@ -24,13 +24,16 @@ from ucp.trace import RecordedBytes
 
 ROSTER = range(1, 6)
 LIFE = 250
-"""Number of inputs until the agent reboots with its store, or a new agent with other settings takes its place."""
+"""Number of inputs that an agent gets before it reboots with its stored data, or before a new agent with other settings
+takes its place.
+"""
 
 Give = Callable[[Agent | ReferenceAgent], None]
 
 
 class Inputs:
-    """Creates inputs that fit the state of an agent, nearly fit the state, or do not fit it at all.
+    """A generator of random inputs for an agent. Some inputs fit the state of the agent, some nearly fit it, and some
+    do not fit it at all.
 
     Timestamps of blocks are below `newest_us`. If `newest_us` is small, some timestamps are equal.
     """

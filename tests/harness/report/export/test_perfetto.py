@@ -14,7 +14,7 @@ from tests.harness.command import harness
 Track = tuple[str, str]
 
 
-class Read:
+class ParsedTrace:
     """A trace that was read: its tracks as pairs (group, name), and the events of each track in Perfetto's order."""
 
     def __init__(self, file: Path) -> None:
@@ -39,20 +39,20 @@ class Read:
 
 
 @pytest.fixture(scope="module")
-def trace(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Read:
+def trace(run: Path, tmp_path_factory: pytest.TempPathFactory) -> ParsedTrace:
     file = tmp_path_factory.mktemp("perfetto") / "run.pftrace"
     exported = harness("export", run, "--perfetto", file)
     assert (exported.returncode, exported.stderr) == (0, "")
-    return Read(file)
+    return ParsedTrace(file)
 
 
-def test_every_handler_run_is_on_its_agents_track(run: Path, trace: Read) -> None:
+def test_every_handler_run_is_on_its_agents_track(run: Path, trace: ParsedTrace) -> None:
     for agent, traced in RunArchive(run).traces.items():
         shown = [(at_ns, event.name) for at_ns, event in trace.on(f"agent {agent}", "handlers")]
         assert shown == [(round(step.t * 1e9), step.handler) for step in traced.runs]
 
 
-def test_arrow_leads_from_sending_run_to_each_receiving_run(run: Path, trace: Read) -> None:
+def test_arrow_leads_from_sending_run_to_each_receiving_run(run: Path, trace: ParsedTrace) -> None:
     starts: dict[int, str] = {}
     arrows: Counter[tuple[str, str]] = Counter()
     for (group, _), _, event in trace.events:
@@ -70,7 +70,7 @@ def test_arrow_leads_from_sending_run_to_each_receiving_run(run: Path, trace: Re
     assert arrows["agent 1", "agent 2"] > 10
 
 
-def test_votes_and_reconciles_are_slices_that_nest(run: Path, trace: Read) -> None:
+def test_votes_and_reconciles_are_slices_that_nest(run: Path, trace: ParsedTrace) -> None:
     names = set()
     for track in trace.tracks.values():
         depth = 0
@@ -83,7 +83,7 @@ def test_votes_and_reconciles_are_slices_that_nest(run: Path, trace: Read) -> No
     assert any(name.startswith("vote on 1.") for name in names)
 
 
-def test_counters_show_chains_and_losses(run: Path, trace: Read) -> None:
+def test_counters_show_chains_and_losses(run: Path, trace: ParsedTrace) -> None:
     chain = [event.double_counter_value for _, event in trace.on("agent 3", "chain (blocks)")]
     assert chain[-1] == len(RunArchive(run).exports.by_agent[3].chain)
     assert max(event.double_counter_value for _, event in trace.on("swarm", "connected groups")) == 2

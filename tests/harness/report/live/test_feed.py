@@ -102,8 +102,8 @@ def test_growing_files_give_the_same_changes(run: Path, tmp_path: Path) -> None:
 
 
 def late_film(run: Path, growing: Path, lag: int = 3) -> list[Change]:
-    """Return the changes of an active run in which each agent writes its trace later than the agent with the next lower
-    ID.
+    """Return the changes for the page of an active run. In this run, each agent writes its trace later than the agent
+    with the next lower ID.
     """
     (growing / "agents").mkdir(parents=True)
     shutil.copy(run / "run.json", growing)

@@ -1,4 +1,4 @@
-"""Judge runs without a simulation. The figures of a run follow from its loss rate and its seed."""
+"""Judge runs without a simulation. The numeric results of a run follow from its loss rate and its seed."""
 
 import tempfile
 from collections.abc import Callable

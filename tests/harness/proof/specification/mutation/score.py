@@ -54,7 +54,7 @@ BATCH = 16
 """Number of edited specifications that a comparison tests at once."""
 
 
-class Found(NamedTuple):
+class MistakeResult(NamedTuple):
     """The result for one mistake.
 
     `by` is the first comparison that detects the mistake, and `difference` is the difference that it finds. Both are
@@ -76,17 +76,18 @@ def digest(edit: Edit) -> str:
     return hashlib.sha256("\n".join(code).encode()).hexdigest()[:16]
 
 
-def stored() -> dict[str, Found]:
+def stored() -> dict[str, MistakeResult]:
     """Return the results of `score.json` by the name of the edit."""
     if not SCORE_FILE.exists():
         return {}
     results = json.loads(SCORE_FILE.read_text("utf-8"))
     return {
-        name: Found(text, by, difference, tuple(missed)) for name, (text, by, difference, missed) in results.items()
+        name: MistakeResult(text, by, difference, tuple(missed))
+        for name, (text, by, difference, missed) in results.items()
     }
 
 
-def store(results: Mapping[str, Found]) -> None:
+def store(results: Mapping[str, MistakeResult]) -> None:
     """Write `score.json`. Each mistake has one line."""
     lines = [f"{json.dumps(edit.name)}: {json.dumps(results[edit.name])}" for edit in edits() if edit.name in results]
     write_atomically(SCORE_FILE, "{\n" + ",\n".join(lines) + "\n}\n")
@@ -95,7 +96,7 @@ def store(results: Mapping[str, Found]) -> None:
 def main() -> int:
     """Test each mistake that has no valid result yet, and store the results."""
     valid = stored()
-    results = {edit.name: Found(digest(edit)) for edit in edits()}
+    results = {edit.name: MistakeResult(digest(edit)) for edit in edits()}
     results |= {name: valid[name] for name, new in results.items() if name in valid and valid[name].text == new.text}
     jobs = int(sys.argv[1]) if len(sys.argv) > 1 else cores()
     for comparison in COMPARISONS:
@@ -105,7 +106,7 @@ def main() -> int:
     return 0
 
 
-def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
+def _find(comparison: Comparison, results: dict[str, MistakeResult], jobs: int) -> None:
     """Run a comparison for each mistake that no earlier comparison detected, and record the differences."""
     name = comparison.name
     waiting = [edit for edit in edits() if (found := results[edit.name]).by is None and name not in found.missed_by]
@@ -130,7 +131,7 @@ def _find(comparison: Comparison, results: dict[str, Found], jobs: int) -> None:
             store(results)
 
 
-def _row(title: str, group: Sequence[Edit], results: Mapping[str, Found]) -> str:
+def _row(title: str, group: Sequence[Edit], results: Mapping[str, MistakeResult]) -> str:
     found = sum(results[edit.name].by is not None for edit in group)
     without_effect = sum(edit.reason is not None for edit in group)
     return f"| {title} | {len(group)} | {found} | {without_effect} | {len(group) - found - without_effect} |"
