@@ -73,10 +73,15 @@ def _section(example: Example) -> str:
         (
             f"## {example.scenario.name}",
             " ".join(example.scenario.about.split()),
-            f"At the end: {figures['agents']} agents, completed blocks {figures['blocks']}, "
-            f"longest chain {figures['longest_chain']}, mutual chain {figures['mutual_chain']}. "
+            f"At the end of the run, {figures['agents']} agents hold a chain, and the swarm has completed "
+            f"{_blocks(figures['blocks'])}. The longest chain has {_blocks(figures['longest_chain'])}, and the part "
+            f"that all chains have in common has {_blocks(figures['mutual_chain'])}. "
             f"Verdict: {bad or 'all checks are good'}.",
             f"![{example.picture.description()}](gallery/{example.name}.svg)",
             f"    ucp-harness run {example.name} --backend sim --seed {example.seed}",
         )
     )
+
+
+def _blocks(count: int) -> str:
+    return "1 block" if count == 1 else f"{count} blocks"
