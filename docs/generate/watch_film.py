@@ -22,11 +22,11 @@ WIDTH, HEIGHT = 1280, 800
 """Size of the browser window in pixels."""
 SCALE = 0.7
 """Size of the picture divided by the size of the window."""
-STEP_S = 10
+STEP_S = 5
 """Mission seconds between two frames of the picture."""
-FRAME_MS = 250
+FRAME_MS = 500
 QUALITY = 30
-MAX_BYTES = 1_000_000
+MAX_BYTES = 2_000_000
 HARNESS = [sys.executable, "-m", "harness.cli"]
 
 
