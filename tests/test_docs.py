@@ -58,6 +58,13 @@ def test_brackets_of_every_paragraph_are_closed(page: Path) -> None:
         assert paragraph.count("(") == paragraph.count(")"), paragraph
 
 
+@pytest.mark.parametrize("page", sorted({*PAGES, *REPOSITORY.glob("*.md")}), ids=lambda page: page.stem)
+def test_rows_of_every_table_have_as_many_cells_as_its_header(page: Path) -> None:
+    for table in re.findall(r"(?:^ *\|.*\n)+", page.read_text(), re.MULTILINE):
+        rows = [re.sub(r"`[^`]*`", "", row).replace("\\|", "") for row in table.splitlines()]
+        assert [row for row in rows if row.count("|") != rows[0].count("|")] == []
+
+
 def test_site_has_every_schema_and_a_page_that_links_to_it(site: Path) -> None:
     page = (site / "reference/schemas.html").read_text()
     for path, text in texts().items():
