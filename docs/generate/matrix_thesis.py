@@ -20,11 +20,11 @@ BEGIN, END = "<!-- table: begin -->\n", "<!-- table: end -->\n"
 
 OBSERVED = {
     0.0: "one chain; no agent reconciles",
-    0.1: "one chain, but for a few last blocks",
-    0.15: "one chain, but for a few last blocks (Figure 4.3)",
+    0.1: "one chain, except for a few of the last blocks",
+    0.15: "one chain, except for a few of the last blocks (Figure 4.3)",
     0.25: "no uniform chain; the mutual chain shrinks",
-    0.3: "divergence becomes noticeable (Figure 4.4)",
-    0.5: "hardly any mutual chain; thrashing (Figure 4.5)",
+    0.3: "chains begin to differ noticeably (Figure 4.4)",
+    0.5: "almost no mutual chain; agents reconcile again and again (Figure 4.5)",
     0.75: "not described",
     1.0: "no agent reconciles; each chain has its own blocks only (Figure 4.6)",
 }
