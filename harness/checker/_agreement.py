@@ -3,9 +3,9 @@ decision.
 
 An agent adapts its chain to the chains of its neighbours in a process called reconcile. A reconcile starts when a vote
 fails, or when a query of another agent shows that the chains differ. Two idle agents send nothing, so their chains stay
-different, and this alone is no violation. A difference is a violation only if the network was fully connected, and if
-the agent with the different chain then completed a reconcile that began after the last change of any other chain. In
-all other cases the checks return `not applicable`.
+different, and this alone is no violation. A difference is a violation under two conditions: the network was fully
+connected, and the agent with the different chain completed a reconcile that began after the last change of any other
+chain. In all other cases the checks return `not applicable`.
 
 The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
 receives blocks. If all agents were switched off, the system consists of all of them. A reconcile then gives a chance to

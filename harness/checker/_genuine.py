@@ -131,9 +131,8 @@ def _explain_unknown_makers(evidence: Evidence, unknown: set[int]) -> str:
 
 
 def _describe_arrival(trace: Trace | None, block_hash: str) -> str:
-    """Return the time at which an agent received a block, and the handler that processed it, as the end of a sentence:
-    "; the block arrived at t=7 s, in receive_commit_block". Return an empty text if the trace does not show the
-    arrival.
+    """Return when an agent received a block, and which handler processed it. The text is the end of a sentence, such as
+    "; the block arrived at t=7 s, in receive_commit_block". It is empty if the trace does not show this.
     """
     came = ("chain+", block_hash)
     for run in trace.runs if trace else ():

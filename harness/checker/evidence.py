@@ -195,8 +195,9 @@ class Evidence:
 
     @cached_property
     def sent_without_trace(self) -> bool:
-        """True if agents of a secured mission may have sent datagrams that no trace contains: revocations of keys, or
-        challenges and echoes, with which a restarted agent checks that its peers are active.
+        """True if agents of a secured mission may have sent datagrams that no trace contains. These datagrams are
+        revocations of keys, challenges and echoes. Challenges and echoes show a restarted agent that its peers are
+        active.
 
         Agents send challenges and echoes only after a restart, or after a datagram that needs one.
         """

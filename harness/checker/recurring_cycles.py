@@ -133,8 +133,8 @@ def _in_traces(evidence: Evidence, busy: Sequence[int], times: int) -> Cycle | N
 def _own_runs(trace: Trace) -> list[HandlerRun]:
     """Return the handler runs since the agent's last restart, at most the last `LAST_RUNS`.
 
-    The result omits handler runs that cannot be part of a cycle of the agent itself: runs for messages that changed no
-    blocks, and attempts to start a reconcile during a reconcile.
+    Two kinds of handler runs cannot be part of a cycle and are omitted: runs for messages that changed no blocks, and
+    attempts to start a reconcile during a reconcile.
     """
     start = max(trace.starts[-1] if trace.starts else 0, len(trace.runs) - LAST_RUNS)
     runs = (run for run in trace.runs[start:] if run.changes or not isinstance(run.trigger, MessageTrigger))

@@ -5,9 +5,11 @@ those for the default settings.
 
 The first line of the file describes the file. Each further line is one step: an input and the expected output. `after`
 is the number of the step before this one. A program that follows these numbers backwards finds all steps of a mission.
-`in` and `out` are lines of virtual time (ucp/contract/CONTRACT.md): times are mission seconds, datagrams are in base64,
-and `timer` is the time at which the next timer expires, or null if no timer runs. `says` and `sends` contain the same
-as text.
+`says` and `sends` contain the step as text. `in` and `out` are lines of virtual time (ucp/contract/CONTRACT.md):
+
+- Times are mission seconds.
+- Datagrams are in base64.
+- `timer` is the time at which the next timer expires, or null if no timer runs.
 
 Over UDP the agent's own blocks have different timestamps, and therefore different hashes. A reader must replace the
 hashes of the blocks 1.1, 1.2 and so on by those in the agent's export.

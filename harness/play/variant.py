@@ -84,8 +84,8 @@ def of_core(
 ) -> Callable[[Callable[..., str]], CoreChange]:
     """Return a decorator that declares a function as the new handler of an algorithm in the agents.
 
-    The keyword arguments declare abilities that the original handler lacks: branches that it returns, messages that it
-    sends, timers that it starts, and local events that it triggers.
+    The keyword arguments declare what the new handler does and the original handler does not: `branches` that it
+    returns, messages that it `sends`, timers that it `starts`, and local events that it `triggers`.
     """
     return lambda run: CoreChange(algorithm, run, branches, sends, starts, triggers)
 

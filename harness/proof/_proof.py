@@ -254,8 +254,8 @@ def prove(
     - `out`: the path of the new scenario file that shows a violation. By default, a new file under `runs/`.
     - `watch`: a function that is called repeatedly with the progress.
 
-    Raises HarnessError if the file cannot be written, if an agent violates an assumption of the state reduction, or if
-    its steps depend on data that are not part of a state.
+    Raises HarnessError if the file cannot be written. Also raises it if an agent violates an assumption of the state
+    reduction, or if its steps depend on data that are not part of a state.
     """
     if bounds.reduced and bounds.why_not_reduced() is not None:
         bounds = replace(bounds, reduced=False)

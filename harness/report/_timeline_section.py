@@ -159,8 +159,8 @@ def _messages(
 ) -> tuple[str, list[str]]:
     """Return the received messages as JSON, and notes about omitted messages.
 
-    The JSON holds the message names, the agent IDs, and one list for each message: time, row of the sender, index of
-    the message name, block, and a pair [row, time] for each receipt.
+    The JSON holds the message names, the agent IDs, and one list for each message. This list holds the time, the row of
+    the sender, the index of the message name, the block, and a pair [row, time] for each receipt.
     """
     if messages is None:
         return "null", ["Messages are not drawn, because the traces are too large"]

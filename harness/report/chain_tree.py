@@ -1,8 +1,8 @@
 """Combine the chains of all agents into a tree. Chains that begin with the same blocks share the marks of these blocks.
 
 A block appears once for each sequence of blocks below it. If agents with diverged chains hold the same block, the block
-is therefore on two branches (Figure 4.4). `marks` converts the tree to the marks of a picture: a box for each block, an
-oval where chains end, and on request an ellipsis for the middle of a long sequence without branches.
+is therefore on two branches (Figure 4.4). `marks` converts the tree to the marks of a picture: a box for each block,
+and an oval where chains end. On request, an ellipsis replaces the middle of a long sequence without branches.
 
 A chain can be longer than Python's recursion limit. All functions here use loops instead of recursion.
 

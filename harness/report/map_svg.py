@@ -30,7 +30,9 @@ from sitl.vehicle import VehicleType
 
 HEIGHT, DIGIT, PADDING = 16, 7.5, 8
 NEAR, FAR = 14, 34
-"""Two distances in pixels, to try one after the other, between a place on the map and the middle of its tag."""
+"""Distances in pixels between a place on the map and the middle of its tag. `FAR` is used if a tag has no room at
+`NEAR`.
+"""
 _DIRECTIONS = ((0, -1), (0, 1), (1, -1), (-1, -1), (1, 1), (-1, 1), (1, 0), (-1, 0))
 
 Box = tuple[float, float, float, float]

@@ -289,13 +289,13 @@ def test_fully_connected_means_no_loss_and_no_partition() -> None:
     assert not NetworkConditions().with_partition([[1]]).fully_connected
 
 
-def test_a_vehicle_in_two_groups_is_refused() -> None:
+def test_vehicle_in_two_groups_is_refused() -> None:
     with pytest.raises(ConditionsError, match=r"partition\[1\]: vehicle 2 .* one group per vehicle"):
         NetworkConditions().with_partition([[1, 2], [2, 3]])
 
 
 @pytest.mark.parametrize("group", [[], [0], [65536], ["1"], [True]])
-def test_a_group_must_be_vehicle_ids(group: list[object]) -> None:
+def test_group_must_be_vehicle_ids(group: list[object]) -> None:
     with pytest.raises(ConditionsError, match=r"partition\[0\]: .*allowed is"):
         NetworkConditions().with_partition([group])  # type: ignore[list-item]
 

@@ -28,7 +28,7 @@ def given(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [{key: value for key, value in entry.items() if value not in (None, False, {}, [])} for entry in entries]
 
 
-def is_played_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
+def assert_plays_again_alike(pytester: pytest.Pytester, directory: Path) -> None:
     """Check that the recorded scenario gives the same chain when it is played again."""
     (kept,) = run_directories(pytester)
     run_record = record(pytester)
@@ -59,7 +59,7 @@ def test_wait_for_continues_until_an_agent_runs_a_handler(pytester: pytest.Pytes
     pytester.makepyfile(WAITING)
     run(pytester, "--ucp-keep", "kept").assert_outcomes(passed=1)
     assert [entry["reconcile"] for entry in record(pytester)["scenario"]["timeline"]] == [[2]]
-    is_played_again_alike(pytester, tmp_path / "again")
+    assert_plays_again_alike(pytester, tmp_path / "again")
 
 
 @pytest.mark.lab
@@ -128,7 +128,7 @@ def test_messages_are_held_back_and_released(pytester: pytest.Pytester, tmp_path
     for fate in (first, every, second, third):
         assert fate["from_s"] < fate["until_s"] == fate["hold_until_s"]
     assert third["until_s"] - second["until_s"] == pytest.approx(200, abs=0.01), "the end of the test releases it"
-    is_played_again_alike(pytester, tmp_path / "again")
+    assert_plays_again_alike(pytester, tmp_path / "again")
 
 
 def test_hold_without_messages_fails_the_test(pytester: pytest.Pytester) -> None:
@@ -162,7 +162,7 @@ def test_conditions_last_as_long_as_their_block(pytester: pytest.Pytester, tmp_p
         ("undone", "loss 0 %, loss 90 % from 4 to 5, loss 90 % from 5 to 4"),
     ]
     assert [entry.get("for_s") for entry in given(run_record["scenario"]["timeline"])] == [100.004, 50.001, None, 5]
-    is_played_again_alike(pytester, tmp_path / "again")
+    assert_plays_again_alike(pytester, tmp_path / "again")
 
 
 INJECTIONS = """
@@ -189,7 +189,7 @@ def test_late_rogue_node_knows_earlier_messages(pytester: pytest.Pytester, tmp_p
     assert [fault["what"] for fault in run_record["faults"]] == names
     assert [injection["what"] for injection in run_record["rogue"]] == names
     assert all(injection["sent"] for injection in run_record["rogue"])
-    is_played_again_alike(pytester, tmp_path / "again")
+    assert_plays_again_alike(pytester, tmp_path / "again")
 
 
 @pytest.mark.lab

@@ -22,7 +22,9 @@ class BlockSignatures:
         self._state = state
         self._by_hash: dict[bytes, bytes] = {}
         self._signed = 0
-        """Number of completed blocks (`state.completed`) at the last call of `held`."""
+        """Number of completed blocks (`state.completed`) at the last call of `held`. Only later blocks still need a
+        signature.
+        """
 
     def held(self) -> Mapping[bytes, bytes]:
         """Sign the agent's own new blocks. Then return the signatures of all blocks that the agent holds."""

@@ -37,8 +37,8 @@ Exactly at the start and at the end, the agent may run.
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each handler run of an agent at a time at which the agent was stopped, and each handled message that was
-    sent over a link while the link was cut.
+    """Yield each handler run that the faults of the scenario make impossible: the agent was stopped at that time, or
+    the link over which the message came was cut.
     """
     if evidence.record is None:
         return

@@ -1,8 +1,9 @@
 """Compare the times of exports, events and handler runs with the time at which the run ended.
 
 An agent exports its chain at its own end: when it is switched off, or when the run ends. An event has the timestamp of
-its logging. Virtual time has one clock, so these times are equal. Processes export one after another and on a machine
-that may be busy, so their exports and last handler runs may be up to `END_WALL_S` later than the end of the run.
+its logging. Virtual time has one clock, so these times are equal. Real processes export one after another, and the
+machine may be busy. Their exports and last handler runs may therefore be up to `END_WALL_S` later than the end of the
+run.
 """
 
 from collections.abc import Iterator
@@ -28,8 +29,11 @@ records tenths of a second.
 
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each export and handler run that is later than the end of the run allows, each export that is too early,
-    and each event whose timestamp differs from the time at which the agent logged it.
+    """Yield each impossible time:
+
+    - an export or a handler run that is later than the end of the run allows
+    - an export before the end of the agent
+    - an event whose timestamp differs from the time at which the agent logged it
     """
     as_logged = not _has_recorded_events(evidence)
     for agent_id, trace in evidence.traces.items():

@@ -1,8 +1,7 @@
 """Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
-The verdict on agents comes from the reference. The installed core repeats the recorded steps in two cases in which its
-own behaviour matters: for a debugger, which stops in the handlers of `ucp`, and for `bisect`, which compares the cores
-of commits.
+The verdict on agents comes from the reference. In two cases the installed core also repeats the recorded steps. A
+debugger can then stop in the handlers of `ucp`, and `bisect` can compare the cores of two commits.
 """
 
 from dataclasses import asdict

@@ -61,7 +61,7 @@ class Outcome(_OutcomeModel):
     """The place of the exception that ended the tested code, or None if there was no exception."""
 
     def as_recorded(self) -> "Outcome":
-        """Return the outcome of an agent core that does not differ from the records."""
+        """Return the outcome that an agent core without any difference from the records would have."""
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 

@@ -1,7 +1,7 @@
 """Repair the order of lines in a damaged trace, in which lines were swapped or occur twice.
 
-A line is moved or removed only if its place is impossible: the time decreases for one line, a handler run comes before
-the run that triggered it, or a recorded effect happens twice.
+A line is moved or removed only if its place is impossible. This is so if the time decreases for one line, if a handler
+run comes before the run that triggered it, or if a recorded effect happens twice.
 """
 
 from collections.abc import Iterator, Sequence

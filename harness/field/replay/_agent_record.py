@@ -114,8 +114,8 @@ class RecordedTrace:
 
     @property
     def doubtful_runs(self) -> dict[int, str]:
-        """The damage to a single trace line, or the change of the agent's clock, that may explain the deviations of a
-        handler run, by the position of the handler run.
+        """Position of a handler run -> damage to one trace line, or a change of the agent's clock. Either may explain
+        why the handler run deviates.
         """
         of_entries = [number for number, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
         doubts = {**self.clock_changes, **(self.doubts or {})}

@@ -107,8 +107,9 @@ class _OtherAgent:
         )
 
     def related_lines(self, their_run: int, run: HandlerRun) -> Iterator[Text]:
-        """Yield the lines of the other agent that are related to the current step: the step that sent the message of
-        the current step, and the steps that received messages from the current step.
+        """Yield text about the lines of the other agent that are related to the current step. These are the line that
+        sent the message of the current step, and the lines that received messages from the current step. A message
+        without a receipt in the trace has a text, too.
         """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger) and trigger.sender == their_run:
@@ -126,8 +127,8 @@ class _OtherAgent:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """Return the handler run that is nearest in time to the current step. Several handler runs may match, because
-        sequence numbers repeat after restarts.
+        """Return at most one of these handler runs: the nearest in time to the current step. Several may match a
+        message, because sequence numbers repeat after restarts.
         """
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]

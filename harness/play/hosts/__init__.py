@@ -6,11 +6,10 @@ the vehicle programs, so their processors share the load. The mechanism of `harn
 
 The program of a vehicle runs on the worker of its agent. Both are in one network there, so the agent reads the
 telemetry of its vehicle without a detour. The pilots and the ground station stay in the lab. Each worker has one more
-connection, which carries their MAVLink messages, the commands that start and end vehicle programs, and the files that
-these programs write. A vehicle program cannot return after a lost connection as an agent does, because its pilot in the
-lab gives it up after 10 s without messages.
+connection. It carries the MAVLink messages between pilots and vehicles, the commands that start and end vehicle
+programs, and the files that these programs write. An agent can return after a lost connection. A vehicle program
+cannot, because its pilot in the lab gives it up after 10 s without messages.
 
-A mesh of tunnels between labs on all computers was rejected. Each link between two computers would have the delay and
-the losses of the real network in addition to those of the scenario, and the engines of several kernels would have to
-agree.
+A mesh of tunnels between labs on all computers was rejected. The delay and the losses of the real network would be
+added to those of the scenario, and the engines of several kernels would have to agree.
 """

@@ -113,7 +113,7 @@ class ChannelProcess:
         return ChannelRecord.model_validate({"model": self._model.to_json(), **totals})
 
     async def watch(self) -> None:
-        """Wait for the process to end without a request, then raise MachineError."""
+        """Raise MachineError when the process ends, unless `stop` was called before."""
         try:
             await self._started.watch()
         except AgentSilentError as error:

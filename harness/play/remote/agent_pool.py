@@ -158,7 +158,9 @@ class RemoteIncarnation:
     def __init__(self, pool: AgentPool, agent_id: int, vehicle: int, port: int, speedup: float) -> None:
         task = StandInTask(pool.add(self), agent_id, vehicle, port, speedup, measures_lag=False)
         self.stand_in_command = task.command(pool.socket_path)
-        """The command of the stand-in, without the mission file."""
+        """The command of the stand-in, the local process that represents the remote agent. The caller appends the
+        mission file.
+        """
         self.epoch_us = 0
         """The start of the mission on the far clock, in microseconds since the Unix epoch."""
         self.left_behind: tuple[str, ...] = ()

@@ -109,5 +109,5 @@ class KnownBlocks:
 
 
 def made_block(agent_id: int, timestamp_us: int) -> Block:
-    """Return a block in the name of an agent that the agent never completed."""
+    """Return a forged block. It bears the ID of an agent that never completed it."""
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, 1, b"made by its captor").encode())

@@ -93,9 +93,9 @@ class StateStore(Sequence[State]):
     """The states of a swarm as bytes, numbered in the order in which they were added.
 
     A state contains a zone, a set of possible remaining times of the timers. The function `contains` takes two zones,
-    and returns true if the first one contains all times of the second one. If the zone of a stored state contains the
-    zone of a new state, and their agents are in the same states, then each run from the new state is also a run from
-    the stored one. The new state therefore gets the number of the stored state. Without `contains`, only equal states
+    and returns true if the first one contains all times of the second one. Suppose that a stored and a new state differ
+    only in their zones, and that the stored zone contains the new one. Each run from the new state is then also a run
+    from the stored state, so the new state gets the number of the stored state. Without `contains`, only equal states
     have the same number.
     """
 

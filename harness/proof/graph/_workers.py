@@ -314,8 +314,9 @@ class Workers:
             yield from other.expansions_of(answer, number, add)
 
     def needed(self, forks: Sequence[State], check: Check) -> Iterator[int | PropertyViolation | None]:
-        """Yield the number of further votes that each state needs until all chains are equal, or the other results of
-        `ExtraVotes.needed`. Raises UndecidedError if a worker reaches its limit of states.
+        """Yield a result for each state: the number of further votes until all chains are equal. If one vote per agent
+        is not enough, the result is the violation that ended a path, or None. Raises UndecidedError if a worker reaches
+        its limit of states.
         """
         for _, _, answer in self._answers(_WorkerHandle.give_forks, forks, check):
             assert isinstance(answer, NeededVotes)

@@ -137,8 +137,8 @@ class _BlockDistribution:
         the captured vehicle.
         """
         self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
-        """Agent -> two values: the data from which the last forged messages to the agent were made, and the number of
-        the agent's states in which the exploration has delivered these messages.
+        """Agent -> the data from which the last forged messages to the agent were made, and a number. The forged
+        messages were delivered to this number of states of the agent.
         """
         self._looked_at = 0
         """Number of states whose own actions were explored. An own action needs no received message."""

@@ -171,8 +171,8 @@ class CanonicalOrder:
     ) -> bool:
         """Return true if these agents with equal descriptions differ only in their blocks.
 
-        They differ only in their blocks if they have no timers and have counted no agent, and if each vote count of the
-        other agents contains all of these agents or none.
+        This is the case if the agents have no timers and have counted no other agent. In addition, each vote count of
+        another agent must contain all agents of the group, or none of them.
         """
         if timers[group[0]]:
             return False

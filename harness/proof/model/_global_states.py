@@ -42,14 +42,14 @@ happen.
 """
 ALL_LEFT = -1
 LIES = 1 << len(ONCE)
-"""The factor of the remaining number of forged messages, in the number that encodes the remaining faults."""
+"""The number that encodes the remaining faults contains the remaining number of forged messages times this factor."""
 COINCIDENCES = LIES << (MAX_LIES.bit_length())
-"""The factor of the remaining number of coincidences, in the number that encodes the remaining faults. Not used if
-coincidences are unlimited.
+"""The number that encodes the remaining faults contains the remaining number of coincidences times this factor. Not
+used if coincidences are unlimited.
 """
 LOSSES = COINCIDENCES << (MAX_COINCIDENCES.bit_length())
-"""The factor of the remaining number of losses, in the number that encodes the remaining faults. Not used if losses are
-unlimited.
+"""The number that encodes the remaining faults contains the remaining number of losses times this factor. Not used if
+losses are unlimited.
 """
 ANY_NUMBER = 1 << 30
 """The number that stands for an unlimited number of losses."""
@@ -89,8 +89,8 @@ class _InstantResult(NamedTuple):
 
 
 class _InstantResults(NamedTuple):
-    """The parts of all possible results of one instant that do not depend on exact timer values: the expired timers,
-    the number of completed blocks, the remaining faults, and the states of the agents.
+    """The possible results of one instant, without the exact timer values: the expired timers, the number of completed
+    blocks, the remaining faults, the forged messages, and the states of the agents.
     """
 
     ended: tuple[int, ...]
@@ -405,8 +405,8 @@ class ModelSwarm:
     def violated(self, state: State) -> Iterator[str]:
         """Yield the characteristics that the attacker has violated although all honest agents follow the protocol.
 
-        Such a violation exists if an agent accepted a message that the captured vehicle never sent, or holds a block in
-        the name of the captured vehicle that the captured vehicle never completed.
+        Such a violation exists in two cases. An agent accepted a message that the captured vehicle never sent. Or an
+        agent holds a block with the name of the captured vehicle, and the captured vehicle never completed this block.
         """
         if _lies(state) < self.bounds.lies:
             yield "1"

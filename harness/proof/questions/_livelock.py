@@ -125,7 +125,9 @@ class _CycleExample(NamedTuple):
 
 
 def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) -> Iterator[Livelock]:
-    """Write an example of each form to `path` and to files next to it, and yield a livelock for each form."""
+    """Write an example of each form of these cycles, and yield a livelock for each form. The first example is written
+    to `path`, and the others to files next to it.
+    """
     by_form = [(len(alike), _nearest(graph, alike)) for alike in forms(graph, cycles)]
     by_form.sort(key=lambda form: form[1][0].script.contradictory)
     for number, (ways, rounds) in enumerate(by_form[:MAX_FORMS], 1):

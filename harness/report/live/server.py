@@ -4,8 +4,8 @@ The server listens on 127.0.0.1 only, and requires the secret token in the page'
 
 At its start, the server makes a list of the files that it serves, so no address can reach another file. The
 Content-Security-Policy lets browsers load from this server only. Three checks reject requests from other pages in the
-same browser: other pages do not know the token, the header Origin shows their origin, and the header Host shows a
-foreign host name that resolves to 127.0.0.1.
+same browser. Other pages do not know the token. Their requests have a foreign origin in the header Origin. If a foreign
+host name resolves to 127.0.0.1, the header Host shows that name.
 
 The log stores all changes for the live page. The changes of an active run are written as they occur, and the changes of
 a finished run all at once. Any number of browsers can read the log, each at its own speed. The log is an unnamed

@@ -1,7 +1,13 @@
 """The base class of all faults. A fault changes agents or their vehicles at one moment of the mission.
 
-The class of a fault defines all its properties: its name in YAML, in records and in pytest, the states of an agent
-before and after it, its effect on agents, vehicles and data, the calls to the backend, and the texts of the report.
+The class of a fault defines all properties of the fault:
+
+- its name in YAML, in records and in pytest
+- the states of an agent before and after the fault
+- its effect on agents, vehicles and data
+- the calls to the backend
+- the texts of the report
+
 Other modules read these properties, and do not compare names. To add a fault, add a class to a file in this directory.
 """
 

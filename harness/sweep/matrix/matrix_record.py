@@ -44,7 +44,7 @@ class MatrixCoverage(BaseModel):
 
 
 class CoverageTally:
-    """The sum of the coverage of all runs."""
+    """The agent states that the runs of a matrix have reached, of all runs together and of each cell."""
 
     def __init__(self) -> None:
         self._runs = 0

@@ -49,7 +49,7 @@ def sent(radio: Radio, metres: Sequence[float], *sends: tuple[int, float], seed:
         ("lora_sf12", 2_301_952),  # low data rate: (8 + 4.25) + (8 + 10 * 5) symbols of 32.768 ms
     ],
 )
-def test_airtime_of_an_answer_of_47_bytes(preset: str, airtime_us: float) -> None:
+def test_airtime_of_47_bytes_follows_the_standards(preset: str, airtime_us: float) -> None:
     assert PRESETS[preset].airtime_ns(ANSWER) == round(1000 * airtime_us)
 
 
