@@ -29,6 +29,6 @@ def test_page_has_each_radio_in_the_table_of_sizes() -> None:
         assert rows.count(f"| {radio} |") == len(MISSIONS["busy"])
 
 
-def test_table_replaces_the_one_between_its_markers() -> None:
+def test_table_replaces_the_old_table_between_its_markers() -> None:
     page = "a\n<!-- size: begin -->\nold\n<!-- size: end -->\nb\n"
     assert put(page, "size", "new\n") == page.replace("old", "new")

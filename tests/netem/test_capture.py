@@ -181,7 +181,7 @@ def test_capture_that_gets_sigterm_first_has_every_frame(tmp_path: Path) -> None
     assert [len(frames(tmp_path / f"{vehicle}.pcapng")) for vehicle in (1, 2)] == [100, 100]
 
 
-def test_a_capture_of_a_mission_that_never_began_leaves_no_files(tmp_path: Path) -> None:
+def test_capture_of_a_mission_that_never_began_leaves_no_files(tmp_path: Path) -> None:
     async def story() -> None:
         async with await Lab.open([1, 2], log=tmp_path / "lab.log") as lab:
             assert await (await LiveCapture.start(lab, tmp_path)).stop() == {}

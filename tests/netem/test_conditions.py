@@ -84,7 +84,7 @@ def test_delay_of_zero_is_none() -> None:
     assert LinkConditions(delay=Delay(0)) == LinkConditions()
 
 
-def test_the_mean_of_bursts_is_the_loss_in_the_long_run() -> None:
+def test_mean_of_bursts_is_the_loss_in_the_long_run() -> None:
     assert GilbertElliott(0.1, 0.3).mean == pytest.approx(0.25)
     assert GilbertElliott(0.1, 0.3, 0.8, 0.04).mean == pytest.approx(0.23)
     assert GilbertElliott(0, 0, loss_good=0.2).mean == 0.2  # begins in the good state and stays in it
@@ -316,7 +316,7 @@ def test_later_changes_by_the_caller_do_not_change_the_value() -> None:
     assert conditions.link(2, 1).loss == 0.5
 
 
-def test_an_unknown_key_is_refused() -> None:
+def test_unknown_key_is_refused() -> None:
     with pytest.raises(ConditionsError, match="los: not a key"):
         NetworkConditions.from_json({"default": {"los": 0.1}})
 
@@ -360,7 +360,7 @@ def test_json_round_trip_keeps_the_conditions(
 
 
 @given(_bursts)
-def test_the_mean_of_bursts_lies_between_the_two_losses(bursts: GilbertElliott) -> None:
+def test_mean_of_bursts_lies_between_the_two_losses(bursts: GilbertElliott) -> None:
     low, high = sorted((bursts.loss_good, bursts.loss_bad))
     assert low - 1e-9 <= bursts.mean <= high + 1e-9
 

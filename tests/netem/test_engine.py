@@ -124,7 +124,7 @@ def test_nothing_crosses_a_partition_and_healing_restores_everything(engine: str
     in_lab([1, 2, 3, 4], engine, tmp_path, story)
 
 
-def test_a_partition_cuts_every_protocol_in_both_directions_at_once(engine: str, tmp_path: Path) -> None:
+def test_partition_cuts_every_protocol_in_both_directions_at_once(engine: str, tmp_path: Path) -> None:
     took_ns: list[tuple[int, int]] = []
 
     async def story(air: Air) -> None:
@@ -198,7 +198,7 @@ def test_each_direction_of_each_pair_has_its_own_loss(engine: str, tmp_path: Pat
     in_lab([1, 2, 3, 4], engine, tmp_path, story)
 
 
-def test_a_hundred_vehicles_get_conditions_for_each_pair_in_seconds(engine: str, tmp_path: Path) -> None:
+def test_hundred_vehicles_get_conditions_for_each_pair_in_seconds(engine: str, tmp_path: Path) -> None:
     vehicles = range(1, 101)
     random = Random(1)
     pairs = {pair: LinkConditions(round(random.random(), 6)) for pair in itertools.permutations(vehicles, 2)}
@@ -220,7 +220,7 @@ def test_a_hundred_vehicles_get_conditions_for_each_pair_in_seconds(engine: str,
     in_lab(vehicles, engine, tmp_path, story)
 
 
-def test_a_partition_leaves_the_loss_inside_its_groups_as_it_is(engine: str, tmp_path: Path) -> None:
+def test_partition_does_not_change_the_loss_inside_its_groups(engine: str, tmp_path: Path) -> None:
     async def story(air: Air) -> None:
         conditions = loss(0.3).with_partition([[1, 2], [3]])
         applied = await air.lab.apply(conditions)
@@ -234,7 +234,7 @@ def test_a_partition_leaves_the_loss_inside_its_groups_as_it_is(engine: str, tmp
     in_lab([1, 2, 3], engine, tmp_path, story)
 
 
-def test_conditions_change_while_traffic_runs_and_counts_go_on(engine: str, tmp_path: Path) -> None:
+def test_change_of_conditions_during_traffic_keeps_the_counts(engine: str, tmp_path: Path) -> None:
     count = PACKETS
 
     async def story(air: Air) -> None:
@@ -263,7 +263,7 @@ def test_conditions_change_while_traffic_runs_and_counts_go_on(engine: str, tmp_
     in_lab([1, 2, 3], engine, tmp_path, story)
 
 
-def test_an_unknown_vehicle_is_refused_and_the_old_conditions_stay(engine: str, tmp_path: Path) -> None:
+def test_unknown_vehicle_is_refused_and_the_old_conditions_stay(engine: str, tmp_path: Path) -> None:
     async def story(air: Air) -> None:
         before = await air.lab.apply(loss(0.25))
         with pytest.raises(ConditionsError, match="unknown vehicle 9"):

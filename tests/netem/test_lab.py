@@ -55,7 +55,7 @@ def test_file_of_a_program_ends_at_its_limit(tmp_path: Path) -> None:
     assert "File too large" in (tmp_path / "err").read_text()
 
 
-def test_a_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_path: Path) -> None:
+def test_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         said = await output(lab, tmp_path, 258, "/bin/sh", "-c", "ip -4 -o addr; ip route; ip link show lo")
         assert lab.addresses[258] == "10.77.1.2"
@@ -103,7 +103,7 @@ def test_cable_can_end_in_an_existing_network(tmp_path: Path) -> None:
         neighbour.wait()
 
 
-def test_an_idle_lab_is_silent(tmp_path: Path) -> None:
+def test_idle_lab_is_silent(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         said = await output(lab, tmp_path, 1, "/bin/sh", "-c", "ip -6 addr show dev eth0")
         assert said == ""
@@ -132,7 +132,7 @@ def test_kernel_counts_datagrams_that_programs_read(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_the_first_process_loads_little() -> None:
+def test_first_process_imports_no_large_modules() -> None:
     """Imports take most of the start time of a virtual network."""
     words = subprocess.check_output(
         [sys.executable, "-P", "-c", "import sys, netem.init; print(*sys.modules)"], text=True
@@ -232,7 +232,7 @@ def test_signal_reaches_the_process_group_of_a_program(tmp_path: Path) -> None:
     ("argv", "word"),
     [(["/no/such/program"], "No such file or directory: '/no/such/program'"), (["/etc/passwd"], "Permission denied")],
 )
-def test_a_program_that_cannot_be_executed_is_one_clear_sentence(tmp_path: Path, argv: list[str], word: str) -> None:
+def test_program_that_cannot_be_executed_causes_one_sentence(tmp_path: Path, argv: list[str], word: str) -> None:
     async def story(lab: Lab) -> None:
         with pytest.raises(SpawnError, match=word):
             await start(lab, tmp_path, 1, *argv)
@@ -241,7 +241,7 @@ def test_a_program_that_cannot_be_executed_is_one_clear_sentence(tmp_path: Path,
     in_lab(tmp_path, story)
 
 
-def test_a_missing_folder_is_one_clear_sentence(tmp_path: Path) -> None:
+def test_missing_folder_causes_one_sentence(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         with pytest.raises(SpawnError, match="No such file or directory"):
             await start(lab, tmp_path / "none", 1, "/bin/true")
@@ -249,7 +249,7 @@ def test_a_missing_folder_is_one_clear_sentence(tmp_path: Path) -> None:
     in_lab(tmp_path, story)
 
 
-def test_a_connection_is_made_inside_the_vehicle(tmp_path: Path) -> None:
+def test_connection_is_made_in_the_network_of_the_vehicle(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         await Air(lab, tmp_path).start_ready(1, "serve", PORT)
         connection = await lab.connect(1, PORT, timeout_s=DEADLINE_S)
@@ -286,7 +286,7 @@ def test_unknown_vehicle_is_refused_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("vehicles", [[], [1, 1], [0], [65536], ["1"]])
-def test_a_lab_of_impossible_vehicles_is_refused(tmp_path: Path, vehicles: list[int]) -> None:
+def test_lab_of_impossible_vehicles_is_refused(tmp_path: Path, vehicles: list[int]) -> None:
     with pytest.raises(ConditionsError, match="vehicles: "):
         asyncio.run(Lab.open(vehicles, log=tmp_path / "lab.log"))
 

@@ -70,7 +70,7 @@ def orchestrator_in(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.parametrize("after_s", MOMENTS)
-def test_a_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) -> None:
+def test_killed_orchestrator_leaves_nothing(tmp_path: Path, after_s: float) -> None:
     before = interfaces()
     with orchestrator_in(tmp_path) as orchestrator:
         assert orchestrator.stdout is not None
@@ -118,7 +118,7 @@ def test_stopped_lab_with_programs_is_removed_after_its_orchestrator(tmp_path: P
     play(until(lambda: not processes_of(tmp_path), "every process is gone"))
 
 
-def test_a_closed_lab_leaves_nothing(tmp_path: Path) -> None:
+def test_closed_lab_leaves_nothing(tmp_path: Path) -> None:
     before = interfaces()
 
     async def run() -> None:

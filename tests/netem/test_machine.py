@@ -140,7 +140,7 @@ def test_unreachable_interpreter_is_named_as_the_only_cause() -> None:
 
 
 @pytest.mark.lab
-def test_a_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
+def test_program_that_a_user_cannot_execute_is_named_with_the_user() -> None:
     done = run_script(_STORY.replace('["/bin/true"]', '["/etc/shadow"]'))
     assert "The program cannot be started: [Errno 13] Permission denied to user" in done.stderr
     assert done.stderr.rstrip().endswith(": '/etc/shadow'")
@@ -162,7 +162,7 @@ def test_each_restriction_of_namespaces_has_its_own_remedy(
     assert expected in _namespaces.way_out("unshare: unshare failed: Operation not permitted")
 
 
-def test_a_missing_tool_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_missing_tool_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(LabUnavailable, match=r"setpriv is not installed\. Install util-linux"):
         asyncio.run(Lab.open([1], log=tmp_path / "lab.log"))
@@ -181,7 +181,7 @@ def test_missing_engine_is_refused_with_the_remedy() -> None:
 
 
 @pytest.mark.lab
-def test_doctor_finds_what_a_lab_finds() -> None:
+def test_doctor_agrees_with_the_engines_of_a_lab() -> None:
     findings = {finding.name: finding for finding in examine()}
     assert [*findings] == ["namespaces", "network", "netem", "nftables", "engine", "shared channel"]
     assert findings["shared channel"].ok

@@ -36,7 +36,7 @@ def received(
 # Statistics
 
 
-def test_a_share_has_wilsons_interval() -> None:
+def test_share_has_wilsons_interval() -> None:
     assert estimates.share(0, 10_000) == Estimate(0.0, 0.0, pytest.approx(Z**2 / (10_000 + Z**2)), 10_000)
     assert estimates.share(100, 100).high == 1.0
     half = estimates.share(50, 100)
@@ -47,7 +47,7 @@ def test_a_share_has_wilsons_interval() -> None:
     assert estimates.share(0, 0) == Estimate(0, 0, 0, 0)
 
 
-def test_a_mean_and_a_deviation_have_normal_intervals() -> None:
+def test_mean_and_deviation_have_normal_intervals() -> None:
     mean = estimates.mean([1.0, 2.0, 3.0, 4.0, 5.0])
     margin = Z * math.sqrt(2.5 / 5)
     assert (mean.measured, mean.low, mean.high) == pytest.approx((3, 3 - margin, 3 + margin))
@@ -114,7 +114,7 @@ def test_rate_is_measured_in_the_longest_queue() -> None:
     assert (found.low, found.high) == pytest.approx((4000 / 0.044, 4000 / 0.036))
 
 
-def test_limit_is_the_number_waiting_at_a_loss() -> None:
+def test_queue_limit_is_the_number_of_waiting_packets_at_a_loss() -> None:
     sent_s = [number * 0.01 for number in range(100)]
     received_packets: list[tuple[int, float]] = []
     for number, now in enumerate(sent_s):  # each waits 95 ms, and three packets may wait

@@ -92,7 +92,7 @@ def test_lost_registers_are_detected(
         ({"of a processor to come"}, "6.1.176", False),
     ],
 )
-def test_the_library_is_for_new_processors_and_old_kernels(
+def test_old_kernels_on_new_processors_need_the_register_library(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: set[str], version: str, needed: bool
 ) -> None:
     monkeypatch.delenv(_uml_registers.FORCE, raising=False)
@@ -103,7 +103,7 @@ def test_the_library_is_for_new_processors_and_old_kernels(
     assert _uml_registers.needed(kernel) is needed
 
 
-def test_a_missing_compiler_is_named_where_it_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_compiler_is_named_where_it_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv(_uml_registers.FORCE, "1")
     with pytest.raises(UmlError, match=r"apt install .*gcc"):
@@ -121,7 +121,7 @@ def test_failed_compiler_is_an_error_with_its_message(tmp_path: Path, monkeypatc
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_a_temporary_directory_may_have_any_name(
+def test_temporary_directory_may_have_any_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, guest: None, capfd: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "a space, a colon: and more"

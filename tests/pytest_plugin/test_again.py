@@ -14,7 +14,7 @@ from tests.pytest_plugin.inner import run, run_directories
 pytest_plugins = "pytester"
 
 
-def test_the_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest.Pytester, tmp_path: Path) -> None:
+def test_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest.Pytester, tmp_path: Path) -> None:
     pytester.makepyfile("""
     import pytest
 
@@ -42,7 +42,7 @@ def test_the_run_of_a_failing_test_is_played_again_and_explored(pytester: pytest
     ("record", "sentence"),
     [('{"schema": "ucp-run/1"}', "it does not name the scenario; give a scenario"), ("{", "truncated or damaged")],
 )
-def test_a_record_without_a_scenario_is_one_sentence(tmp_path: Path, record: str, sentence: str) -> None:
+def test_record_without_a_scenario_causes_one_sentence(tmp_path: Path, record: str, sentence: str) -> None:
     (tmp_path / "run.json").write_text(record)
     with pytest.raises(HarnessError, match=sentence):
         load_recorded_scenario(tmp_path)

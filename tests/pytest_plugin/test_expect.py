@@ -17,7 +17,7 @@ def test_expect_accepts_all_figures_and_characteristics() -> None:
     assert CHARACTERISTIC_NUMBERS.keys() == CHECKS.keys()
 
 
-def test_a_characteristic_that_is_not_named_may_be_anything_but_violated() -> None:
+def test_characteristic_without_expectation_must_not_be_violated() -> None:
     expect = Expect.model_validate({"characteristics": {5: "violated", "6": "not applicable"}})
     verdicts = ("holds", "violated", "not applicable")
     as_expected = {n: [expect.as_expected(str(n), verdict) for verdict in verdicts] for n in (1, 5, 6)}
@@ -37,7 +37,7 @@ def test_a_characteristic_that_is_not_named_may_be_anything_but_violated() -> No
         ({"min": 0}, None, "blocks is not known, and should be at least 0"),
     ],
 )
-def test_figures_are_compared_with_what_they_should_be(wanted: Any, figure: float | None, sentence: str | None) -> None:
+def test_figures_are_compared_with_their_expectations(wanted: Any, figure: float | None, sentence: str | None) -> None:
     expect = Expect.model_validate({"figures": {"blocks": wanted}})
     assert list(expect.out_of_range({"blocks": figure})) == ([sentence] if sentence else [])
 
@@ -79,7 +79,7 @@ CHAINS = {10: "abcd", 28: "abcd", 32: "ab", 118: "abx"}
         ),
     ],
 )
-def test_chains_are_compared_with_what_they_should_be(wanted: dict[str, Any], sentences: list[str]) -> None:
+def test_chains_are_compared_with_their_expectations(wanted: dict[str, Any], sentences: list[str]) -> None:
     assert list(Expect.model_validate(wanted).unexpected_common_blocks(CHAINS)) == sentences
 
 

@@ -18,7 +18,7 @@ def collected(pytester: pytest.Pytester, *arguments: object) -> list[str]:
     return [line for line in result.outlines if "::" in line]
 
 
-def test_a_file_is_a_test_for_each_backend_and_seed(pytester: pytest.Pytester) -> None:
+def test_file_becomes_a_test_for_each_backend_and_seed(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "loss.yaml", expect={"backends": ["sim", "process"], "seeds": [1, 7]})
     assert collected(pytester, "loss.yaml") == [
         f"loss.yaml::{name}" for name in ("sim-seed1", "sim-seed7", "process-seed1", "process-seed7")
@@ -44,7 +44,7 @@ def test_selected_file_with_expectations_is_a_test(
     assert collected(pytester, ".") == everything
 
 
-def test_a_run_as_expected_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
+def test_run_as_expected_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
     text = (
         "name: x\n# expect: nothing\nduration_s: 100\nexpect:\n  # as usual\n  seeds: [1, 2]\nvehicles:\n  kind: none\n"
     )
@@ -98,7 +98,7 @@ def test_violation_is_reported_with_evidence_and_report_path(pytester: pytest.Py
         ),
     ],
 )
-def test_mistake_in_a_file_is_one_sentence_at_collection(
+def test_mistake_in_a_file_causes_one_sentence_at_collection(
     pytester: pytest.Pytester, expect: dict[str, object], sentence: str
 ) -> None:
     write_scenario(pytester, "s.yaml", expect=expect)

@@ -60,7 +60,7 @@ def test_unplayable_scenario_is_reported_in_one_sentence(pytester: pytest.Pytest
     no_internals(result)
 
 
-def test_a_fate_that_never_matched_fails_the_test(pytester: pytest.Pytester) -> None:
+def test_fate_without_a_match_fails_the_test(pytester: pytest.Pytester) -> None:
     write_scenario(pytester, "s.yaml", fates=[{"message": "Commit Block", "block": "1.900", "drop": True}])
     pytester.makepyfile('import pytest\n@pytest.mark.scenario("s.yaml")\ndef test_s(scenario): pass')
     result = run(pytester)

@@ -144,7 +144,7 @@ def test_fixtures_and_markers_need_no_import(pytester: pytest.Pytester) -> None:
 
 
 @pytest.mark.parametrize("ours", ["harness", "ucp", "sitl", "netem"])
-def test_a_project_with_a_package_of_the_same_name_keeps_its_tests(pytester: pytest.Pytester, ours: str) -> None:
+def test_project_with_a_package_of_the_same_name_keeps_its_tests(pytester: pytest.Pytester, ours: str) -> None:
     package = pytester.mkpydir(ours)
     (package / "theirs.py").write_text("ANSWER = 42")
     pytester.makepyfile(f"""

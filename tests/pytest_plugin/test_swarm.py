@@ -38,19 +38,19 @@ FORCED_TIE = {
 }
 
 
-def test_the_story_of_a_partition_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
+def test_story_of_a_partition_passes_and_leaves_nothing(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(STORY)
     run(pytester).assert_outcomes(passed=1)
     assert not run_directories(pytester)
 
 
 @pytest.mark.parametrize("seed", range(2, 12))
-def test_the_story_holds_with_any_seed(pytester: pytest.Pytester, seed: int) -> None:
+def test_story_holds_with_any_seed(pytester: pytest.Pytester, seed: int) -> None:
     pytester.makepyfile(STORY)
     run(pytester, "--ucp-seed", seed).assert_outcomes(passed=1)
 
 
-def test_a_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) -> None:
+def test_partition_heals_at_the_end_of_its_block(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         def test_story(swarm):
@@ -79,7 +79,7 @@ def test_processes_pass_the_same_test(pytester: pytest.Pytester) -> None:
     assert not run_directories(pytester)
 
 
-def test_the_tests_in_the_documentation_pass(pytester: pytest.Pytester) -> None:
+def test_tests_in_the_documentation_pass(pytester: pytest.Pytester) -> None:
     for number, page in enumerate((REPOSITORY / "README.md", PAGE)):
         code = [
             block for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL) if "def test_" in block
@@ -191,7 +191,7 @@ def test_queries_change_nothing_and_the_run_can_be_played_again(pytester: pytest
         assert exports[0] == exports[1] == read_export(tmp_path / "again" / "agents" / f"{agent}.chain.json")
 
 
-def test_a_violation_fails_the_test_with_its_evidence_and_its_report(pytester: pytest.Pytester) -> None:
+def test_violation_fails_the_test_with_its_evidence_and_its_report(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(f"""
     import pytest
 

@@ -30,7 +30,7 @@ FIRST_AND_LAST = """
 
 @pytest.mark.uml
 @pytest.mark.any_user
-def test_a_session_is_played_in_user_mode_linux(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_session_runs_in_user_mode_linux(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     pytester.makepyfile(FIRST_AND_LAST)
     monkeypatch.setenv("TMPDIR", str(pytester.mkdir("temporary")))
     options = ("-p", "no:cacheprovider", "--ucp-kernel", "uml", "--ucp-backend", "process", "--ucp-keep", "kept")

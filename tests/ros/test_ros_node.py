@@ -39,7 +39,7 @@ def test_ros_agent_follows_the_algorithms_with_loss_and_a_partition(played: Path
     assert "1 2 | 3" in partition.detail
 
 
-def test_nothing_of_ros_is_on_the_air(played: Path) -> None:
+def test_captures_contain_no_datagram_of_ros(played: Path) -> None:
     captures = sorted((played / "mixed" / "capture").glob("*.pcapng"))
     assert len(captures) == 3
     for capture in captures:

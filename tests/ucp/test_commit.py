@@ -19,7 +19,7 @@ def without(dropped: type[Message]):
 
 
 @takes("build_data_block", "building", "full")
-def test_a_block_is_full_when_the_largest_event_might_not_fit_any_more() -> None:
+def test_block_is_full_if_the_largest_event_may_not_fit() -> None:
     air = Air([1])
     agent = air.agents[1]
     for _ in range(2):
@@ -52,7 +52,7 @@ def test_event_above_max_event_bytes_is_refused() -> None:
 
 
 @takes("process_next_deque_block", "proposed")
-def test_a_full_block_is_proposed_to_go_on_top_of_the_own_chain() -> None:
+def test_full_block_is_proposed_on_top_of_the_own_chain() -> None:
     air = Air([1, 2])
     air.fill_block(2)
     air.settle()
@@ -112,7 +112,7 @@ def test_blocks_wait_their_turn_while_a_vote_runs() -> None:
 
 
 @takes("receive_vote_add_block", "no", "counted already", "another block")
-def test_a_responder_counts_once_per_round() -> None:
+def test_responder_counts_once_per_round() -> None:
     air = Air([1, 2, 3], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     agent = air.agents[1]
@@ -125,7 +125,7 @@ def test_a_responder_counts_once_per_round() -> None:
 
 
 @takes("receive_vote_add_block", "no vote running")
-def test_a_vote_after_the_timer_does_not_count() -> None:
+def test_vote_after_the_timer_does_not_count() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     air.settle()
@@ -136,7 +136,7 @@ def test_a_vote_after_the_timer_does_not_count() -> None:
 
 
 @takes("vote_timer_expiration", "not approved")
-def test_a_tied_vote_is_not_approved() -> None:
+def test_tied_vote_is_not_approved() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     block_hash = air.fill_block(1)
     air.agents[1].receive_message(2, 0, BlockAddResponse(block_hash, approve=False), 1.0)
@@ -161,7 +161,7 @@ def test_vote_that_ends_during_a_reconcile_is_repeated_after_it() -> None:
 
 
 @takes("vote_timer_expiration", "chain changed")
-def test_an_approved_vote_is_repeated_when_the_chain_changed_meanwhile() -> None:
+def test_approved_vote_is_repeated_if_the_chain_changed_meanwhile() -> None:
     """If the vote were not repeated, the agent would become idle with a block in its deque (characteristic 2)."""
     air = Air([1, 2, 3])
     first = air.fill_block(1)
@@ -202,7 +202,7 @@ def test_setting_changes_the_order_of_the_tests_of_algorithm_5(changed_before_ta
         pytest.param(True, 1, marks=takes("receive_vote_add_block", "another round")),
     ],
 )
-def test_a_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(names_chain: bool, yes: int) -> None:
+def test_late_vote_of_an_earlier_round_counts_unless_votes_name_the_chain(names_chain: bool, yes: int) -> None:
     air = Air([1, 2, 3], fate=lambda *_: [], settings=Settings(vote_names_chain=names_chain))
     block_hash = air.fill_block(1)
     earlier_round = BlockAddResponse(block_hash, True, b"\1" * 32)
@@ -234,7 +234,7 @@ def test_reconcile_in_the_gap_replaces_the_query_of_asks_after_commit() -> None:
 
 @takes("receive_request_add_block", "disapprove")
 @takes("receive_commit_block", "does not succeed")
-def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
+def test_commit_of_a_block_that_does_not_follow_the_top_is_ignored() -> None:
     latency = uniform_latency(Random(1))
     lose_first_commit_to_3 = lambda s, r, m: [] if isinstance(m, CommitBlock) and r == 3 else latency(s, r, m)  # noqa: E731
     air = Air([1, 2, 3], fate=lose_first_commit_to_3)
@@ -248,7 +248,7 @@ def test_a_commit_that_does_not_succeed_the_top_is_not_followed() -> None:
 
 
 @takes("receive_commit_block", "held already")
-def test_a_second_copy_of_a_block_is_never_committed() -> None:
+def test_second_copy_of_a_block_is_never_committed() -> None:
     """No correct agent sends a second copy. Characteristic 3 holds even if an agent does."""
     air = Air([1, 2])
     air.fill_block(2)
@@ -262,7 +262,7 @@ def test_a_second_copy_of_a_block_is_never_committed() -> None:
     assert len(agent.state.chain) == 1
 
 
-def test_the_ignore_commit_quirk_misses_commits() -> None:
+def test_ignore_commit_quirk_misses_commits() -> None:
     air = Air([1, 2])
     air.agents[2].replace_handlers(wrong_handlers({"ignore_commit": 1.0}, Random(0)))
     air.fill_block(1)
@@ -274,7 +274,7 @@ def test_the_ignore_commit_quirk_misses_commits() -> None:
 @takes("process_next_deque_block", "reconcile in progress")
 @takes("receive_request_add_block", "reconcile in progress")
 @takes("receive_commit_block", "reconcile in progress")
-def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
+def test_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
@@ -290,7 +290,7 @@ def test_a_reconciling_agent_neither_votes_nor_commits_nor_proposes() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("ignore_commit", 1.5), ("ignore_commit", True), ("crash_on_tie", 1), ("fly", True)]
 )
-def test_an_impossible_quirk_is_refused(name: str, value: object) -> None:
+def test_impossible_quirk_is_refused(name: str, value: object) -> None:
     with pytest.raises(ValueError, match=name):
         check_quirk(name, value)
 

@@ -162,7 +162,7 @@ def test_mission_files_fit_their_schema_and_name_needed_features() -> None:
 
 
 @pytest.mark.parametrize("transcript", TRANSCRIPTS, ids=lambda path: path.stem)
-def test_a_transcript_fits_its_schema(transcript: Path) -> None:
+def test_transcript_fits_its_schema(transcript: Path) -> None:
     for line in transcript.read_text().splitlines():
         validator("virtual").validate(json.loads(line))
 

@@ -49,13 +49,13 @@ def test_encoded_message_decodes_and_fits_one_datagram(sender: int, sequence: in
     assert decode(datagram) == (sender, sequence, message)
 
 
-def test_the_largest_block_fits_a_datagram_without_fragmentation() -> None:
+def test_largest_block_fits_a_datagram_without_fragmentation() -> None:
     datagram = encode(65535, 0, CommitBlock(Block(65535, 2**64 - 1, bytes(1024)), bytes(32)))
     assert len(datagram) == HEADER.size + 32 + 12 + 1024 <= 1500 - 28
 
 
 @given(messages, st.data())
-def test_a_truncated_or_padded_datagram_is_malformed(message: Message, data: st.DataObject) -> None:
+def test_truncated_or_padded_datagram_is_malformed(message: Message, data: st.DataObject) -> None:
     datagram = encode(1, 0, message)
     cut = data.draw(st.integers(0, len(datagram) - 1))
     for damaged in (datagram[:cut], datagram + b"\0", datagram + bytes(2000)):
@@ -67,7 +67,7 @@ def test_a_truncated_or_padded_datagram_is_malformed(message: Message, data: st.
     ("offset", "value", "reason"),
     [(0, 0x00, "wrong magic"), (2, 2, "wrong version"), (3, 0, "unknown type"), (3, 10, "unknown type")],
 )
-def test_a_foreign_header_is_malformed(offset: int, value: int, reason: str) -> None:
+def test_foreign_header_is_malformed(offset: int, value: int, reason: str) -> None:
     datagram = bytearray(encode(1, 0, RequestForBlock(bytes(32))))
     datagram[offset] = value
     with pytest.raises(MalformedDatagramError, match=reason):

@@ -385,7 +385,7 @@ def test_agent_plays_a_later_contract_without_new_features() -> None:
     assert parse_mission(later).agent_id == 7
 
 
-def test_a_killed_agent_leaves_no_half_export(directory: Path) -> None:
+def test_killed_agent_leaves_no_incomplete_export(directory: Path) -> None:
     """If the agent is killed at any time, the old export or the complete new export remains."""
     rng = Random(5)
     for _ in range(5):

@@ -136,7 +136,7 @@ def test_outvoted_agent_rebuilds_on_the_chain_of_the_majority() -> None:
     assert air.branches(1, "receive_response_block_for_hash")[0] == "committed"
 
 
-def test_a_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
+def test_vote_against_a_diverged_chain_starts_the_reconcile() -> None:
     air = diverged()
     air.fill_block(1)
     air.settle()
@@ -203,7 +203,7 @@ def test_missing_block_in_phase_3_returns_the_rest_of_the_stack() -> None:
 
 
 @takes("reconcile_phase_1_timer_expiration", "at inception")
-def test_the_inception_block_is_never_popped() -> None:
+def test_inception_block_is_never_popped() -> None:
     air = Air([1, 2], fate=lambda *_: [])
     agent = air.agents[1]
     agent.begin_reconcile(0.0)
@@ -278,14 +278,14 @@ def test_phase_2_follows_the_plurality() -> None:
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: block")
-def test_a_tie_in_phase_2_goes_to_the_oldest_block() -> None:
+def test_tie_in_phase_2_goes_to_the_oldest_block() -> None:
     air, branch = phase_2([(A, 9), (B, 1)])
     assert branch == "tie: block"
     assert air.agents[1].state.majority_response_block_hash == B
 
 
 @takes("reconcile_phase_2_timer_expiration", "tie: block")
-def test_a_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
+def test_tie_of_equal_timestamps_goes_to_the_lowest_hash() -> None:
     air, _ = phase_2([(B, 5), (A, 5)])
     assert air.agents[1].state.majority_response_block_hash == A
 
@@ -452,7 +452,7 @@ def test_reconciling_agent_answers_no_message_and_does_not_restart() -> None:
     assert agent.state.reconciles == 1
 
 
-def test_a_divergence_of_50_blocks_is_reconciled() -> None:
+def test_divergence_of_50_blocks_is_reconciled() -> None:
     air = Air([1, 2, 3], fate=part({1}, {2, 3}))
     for _ in range(50):
         air.fill_block(1)

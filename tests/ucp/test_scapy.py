@@ -176,6 +176,6 @@ def test_ls_shows_each_message_with_its_name_in_the_thesis(message: Any, capsys:
     assert LAYERS[message]().name == message.NAME
 
 
-def test_an_agent_starts_without_scapy() -> None:
+def test_agent_starts_without_scapy() -> None:
     program = "import sys, ucp.node; sys.exit('scapy' in sys.modules)"
     subprocess.run([sys.executable, "-P", "-c", program], check=True)

@@ -85,7 +85,7 @@ def test_arming_and_disarming_are_events() -> None:
     assert describe(disarmed, data) == "[0.0 s] disarmed in mode 4"
 
 
-def test_a_status_text_is_an_event() -> None:
+def test_status_text_is_an_event() -> None:
     ((event_id, data),) = source().receive(frames(text("PreArm: Need Position Estimate", severity=2)), 0.0)
     assert (event_id, data) == (STATUS_TEXT, struct.pack(">IB", 0, 2) + b"PreArm: Need Position Estimate")
     assert describe(event_id, data) == "[0.0 s] critical: PreArm: Need Position Estimate"
@@ -133,7 +133,7 @@ def test_equal_seeds_give_equal_intervals_of_positions() -> None:
     assert positions(source(seed=1), 100) != positions(source(seed=2), 100)
 
 
-def test_a_position_holds_attitude_battery_and_mode() -> None:
+def test_position_holds_attitude_battery_and_mode() -> None:
     events = source()
     status = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 15_900, 1_000, 77, 0, 0, 0, 0, 0, 0)
     events.receive(frames(heartbeat(GUIDED, armed=True), status, position_msg()), 0.0)
@@ -163,7 +163,7 @@ def test_a_position_holds_attitude_battery_and_mode() -> None:
     )
 
 
-def test_a_position_before_the_first_fix_is_no_event() -> None:
+def test_position_before_the_first_fix_is_no_event() -> None:
     events = source()
     nowhere = frames(good_estimate(), position_msg(lat=0, lon=0))
     assert not any(events.receive(nowhere, float(now)) for now in range(100))

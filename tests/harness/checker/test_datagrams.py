@@ -155,7 +155,7 @@ def test_datagram_of_a_paused_agent_may_stay_unread(whole: Path, tmp_path: Path)
     assert not any("unread" in detail for detail in details)
 
 
-def test_datagram_under_way_at_a_kill_may_lack_its_line(whole: Path, tmp_path: Path) -> None:
+def test_datagram_in_transit_at_a_kill_may_lack_its_line(whole: Path, tmp_path: Path) -> None:
     assert judged(whole, tmp_path, 3, 1).beside["records"].verdict == "agree"
 
 

@@ -211,7 +211,7 @@ def test_json_holds_every_block_and_event(flown: Air, run_dir: Path) -> None:
 # Missing, damaged or hostile input
 
 
-def test_missing_export_of_an_agent_is_one_sentence(run_dir: Path) -> None:
+def test_missing_export_of_an_agent_causes_one_sentence(run_dir: Path) -> None:
     (run_dir / "agents" / "2.chain.json").unlink()
     edit(run_dir / "run.json", lambda run: run["agents"].update({"2": {"outcome": "killed"}}))
     done = harness("chain", run_dir)
@@ -235,7 +235,7 @@ def test_damaged_export_has_status_2_and_the_rest_are_printed(run_dir: Path) -> 
     assert "agent 1: " in done.stdout
 
 
-def test_chain_of_nothing_has_status_2(tmp_path: Path) -> None:
+def test_chain_command_without_exports_has_status_2(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
         done = harness("chain", path)
         assert done.returncode == 2

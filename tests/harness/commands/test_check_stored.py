@@ -58,7 +58,7 @@ def test_check_reports_another_stored_verdict(
     assert expected in harness("check", directory).stderr
 
 
-def test_run_edited_after_its_end_is_status_1(tmp_path: Path) -> None:
+def test_run_edited_after_its_end_has_status_1(tmp_path: Path) -> None:
     """Outside a clone, the commit is unknown. The versions of the package and of the reference then identify the
     checker.
     """

@@ -55,7 +55,7 @@ def test_violation_among_unreadable_exports_has_status_1(tmp_path: Path) -> None
     assert harness("check", *paths).returncode == 1
 
 
-def test_check_of_nothing_has_status_2(tmp_path: Path) -> None:
+def test_check_without_exports_has_status_2(tmp_path: Path) -> None:
     for arguments in ([tmp_path], [tmp_path / "nowhere"]):
         done = harness("check", *arguments)
         assert done.returncode == 2

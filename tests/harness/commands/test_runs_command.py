@@ -54,7 +54,7 @@ def test_runs_opens_a_report_or_names_the_command_that_writes_it(runs: Path, tmp
     assert "has 2 runs, and no run 3" in harness("runs", runs, "--open", "3").stderr
 
 
-def test_missing_folder_of_runs_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_folder_of_runs_causes_one_sentence(tmp_path: Path) -> None:
     refused = harness("runs", tmp_path / "none")
     assert refused.returncode == 2
     assert "`ucp-harness run` creates it" in refused.stderr

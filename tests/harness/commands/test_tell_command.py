@@ -71,7 +71,7 @@ def test_run_of_processes_accepts_events_and_cannot_pause(tmp_path: Path) -> Non
 
 
 @pytest.mark.any_user
-def test_tell_without_an_active_run_is_one_sentence(tmp_path: Path) -> None:
+def test_tell_without_an_active_run_causes_one_sentence(tmp_path: Path) -> None:
     done = harness("tell", tmp_path, "heal")
     assert done.returncode == 2
     assert sentences(done.stderr)[0].startswith(f"{tmp_path}: no active run here takes commands: start")
@@ -119,7 +119,7 @@ def test_shell_runs_a_command_in_the_network_of_a_vehicle(kind: str, tmp_path: P
             visitor.kill()
 
 
-def test_shell_without_an_active_run_is_one_sentence(tmp_path: Path) -> None:
+def test_shell_without_an_active_run_causes_one_sentence(tmp_path: Path) -> None:
     done = harness("shell", tmp_path)
     assert done.returncode == 2
     assert f"{tmp_path} has no running vehicles: the run has ended, or has not begun;" in sentences(done.stderr)[0]

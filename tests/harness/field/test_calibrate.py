@@ -74,7 +74,7 @@ def test_fit_equals_the_maximum_of_the_likelihood() -> None:
         assert likelihood(DeliveryModel(model.range_m, model.spread * factor**2, model.floor)) < best
 
 
-def test_load_costs_messages() -> None:
+def test_load_increases_the_fitted_loss() -> None:
     rng = Random(3)
     drawn = [
         each._replace(others=others, delivered=each.delivered and rng.random() > 0.2 * others)

@@ -151,7 +151,7 @@ def test_truncated_log_keeps_the_records_before_its_end(tmp_path: Path, name: st
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_lost_bytes_take_only_their_messages_along(tmp_path: Path, name: str) -> None:
+def test_lost_bytes_affect_only_their_messages(tmp_path: Path, name: str) -> None:
     data = WRITERS[name]()
     whole = {each[2:] for each in read(tmp_path, name, data).vehicles[0].positions}
     half = len(data) // 2

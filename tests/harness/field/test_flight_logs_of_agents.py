@@ -77,7 +77,7 @@ def test_positions_match_a_telemetry_log(tmp_path: Path) -> None:
     assert match.clock_ahead_s == pytest.approx(-3.0, abs=0.6)
 
 
-def test_earlier_flight_along_the_same_path_is_not_of_the_agent(tmp_path: Path) -> None:
+def test_earlier_flight_along_the_same_path_matches_no_agent(tmp_path: Path) -> None:
     (tmp_path / "1.bin").write_bytes(dataflash_file())
     (tmp_path / "2.bin").write_bytes(dataflash_file(flight_messages(first_us=605_000_000)))
     logs = [read_flight_log(tmp_path / name) for name in ("1.bin", "2.bin")]

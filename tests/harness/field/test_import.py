@@ -274,7 +274,7 @@ def test_each_unusable_file_is_reported(tmp_path: Path) -> None:
     assert len(sentences(done.stderr)) == 3 and all(name in done.stderr for name in ("a.csv", "b.txt", "c.bag"))
 
 
-def test_trace_packed_with_zstd_names_the_way_out(run: Path, tmp_path: Path) -> None:
+def test_trace_packed_with_zstd_names_the_solution(run: Path, tmp_path: Path) -> None:
     zstandard = pytest.importorskip("zstandard")
     (tmp_path / "1.trace.jsonl.zst").write_bytes(zstandard.compress((run / "agents/1.trace.jsonl").read_bytes()))
     record = imported(tmp_path / "home", tmp_path / "1.trace.jsonl.zst", run / "agents/1.chain.json")

@@ -133,7 +133,7 @@ def test_wrong_agent_is_explained_by_a_quirk_or_its_first_deviation(tmp_path: Pa
     assert any("agent 2 did not react to" in remark and "receive_commit_block" in remark for remark in parted.remarks)
 
 
-def test_edited_core_is_named_if_a_right_record_does_not_play(tmp_path: Path) -> None:
+def test_edited_core_is_named_if_a_correct_record_does_not_play(tmp_path: Path) -> None:
     home = field_records(tmp_path / "home", flown(tmp_path / "run", agents=3, duration_s=100))
     right = "approve = message.chain_hash == core.chain.top_chain_hash"
     core = edited(tmp_path, Bug("commit.py", right, right.replace("==", "!=")))

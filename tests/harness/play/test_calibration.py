@@ -110,7 +110,7 @@ def test_missing_engine_gives_status_3(monkeypatch: pytest.MonkeyPatch) -> None:
     assert json.loads(as_json.stdout)["measured"] == []
 
 
-def test_a_machine_that_is_too_busy_is_one_sentence_and_status_3(
+def test_busy_machine_causes_one_sentence_and_status_3(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def too_busy(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:

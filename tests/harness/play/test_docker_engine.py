@@ -36,7 +36,7 @@ def listening(path: Path) -> socket.socket:
     return server
 
 
-def test_missing_engine_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_engine_causes_one_sentence(tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path)
     for host, word in (
         (f"unix://{tmp_path}/nowhere.sock", "there is no Docker engine: .* install it"),
@@ -53,7 +53,7 @@ def test_missing_engine_is_one_sentence(tmp_path: Path) -> None:
         assert not (tmp_path / "run").exists()
 
 
-def test_stopped_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stopped_engine_causes_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "docker.sock"
     listening(path).close()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
@@ -62,7 +62,7 @@ def test_stopped_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody who may not")
-def test_inaccessible_engine_is_one_sentence(tmp_path: Path) -> None:
+def test_inaccessible_engine_causes_one_sentence(tmp_path: Path) -> None:
     path = Path("/tmp", f"ucp-test-{os.getpid()}.sock")  # noqa: S108  (every user can reach it)
     server = listening(path)
     path.chmod(0o600)
@@ -78,7 +78,7 @@ except docker_engine.DockerError as error: print(error)
     assert done.stdout == f"{path} is not accessible to this user: use sudo\n", done.stderr
 
 
-def test_silent_engine_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_engine_causes_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "docker.sock"
     server = listening(path)
     monkeypatch.setenv("DOCKER_HOST", f"unix://{path}")
@@ -116,7 +116,7 @@ def test_full_disk_does_not_count_as_a_stopped_engine() -> None:
     one.close()
 
 
-def test_an_image_that_cannot_be_built_is_one_sentence() -> None:
+def test_image_that_cannot_be_built_causes_one_sentence() -> None:
     steps = [{"stream": "Step 1/9 : ARG BASE"}, {"stream": " ---> 1"}, {"error": "no such host"}]
     missing = requests.Response()
     missing.status_code = 404
@@ -203,7 +203,7 @@ def test_output_of_a_container_goes_to_the_right_file(tmp_path: Path) -> None:
     assert (tmp_path / "err").read_bytes() == b"two\n"
 
 
-def test_the_image_is_built_from_the_packages_and_named_by_their_content(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_image_is_built_from_the_packages_and_named_by_their_content(monkeypatch: pytest.MonkeyPatch) -> None:
     context = _images.context()
     assert {"Dockerfile", "ucp/node.py", "sitl/embedded.py"} < set(context)
     assert not any("__pycache__" in name or name.startswith("harness") for name in context)
@@ -213,7 +213,7 @@ def test_the_image_is_built_from_the_packages_and_named_by_their_content(monkeyp
     assert _images.project_name() != name
 
 
-def test_an_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) -> None:
+def test_image_has_its_own_interpreter_environment_and_files(tmp_path: Path) -> None:
     program = tmp_path / "arducopter"
     program.touch()
     argv = [sys.executable, "-m", "ucp.node", str(program), "/no/such"]
@@ -263,7 +263,7 @@ def test_compose_file_has_all_vehicles_at_their_addresses(tmp_path: Path) -> Non
     assert "compose.yaml exists: choose another name" in sentences(again.stderr)[0]
 
 
-def test_a_compose_file_shows_each_agent_its_own_bundle_and_holds_no_secret(tmp_path: Path) -> None:
+def test_compose_file_has_no_secret_and_mounts_the_own_bundle_only(tmp_path: Path) -> None:
     home = KeyDirectory.new(tmp_path / "home", [1, 2], seals=True, epoch_s=600.0)
     home.write_bundles(tmp_path / "bundles")
     keys = {"agents": 2, "vehicles": {"kind": "none"}}

@@ -76,7 +76,7 @@ def test_agent_neither_reads_nor_changes_files_of_other_agents(tmp_path: Path) -
     assert {path.name for path in agents.iterdir() if path.is_dir()} == {"1-2", "3-1"}
 
 
-def test_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
+def test_containers_support_faults_of_agents_and_vehicles(tmp_path: Path) -> None:
     timeline = [
         {"at_s": 40, "pause": [1]},
         {"at_s": 60, "resume": [1]},
@@ -194,7 +194,7 @@ def test_stopped_engine_ends_the_run(hurt: Any, sentence: str, tmp_path: Path) -
     assert containers(out) == []
 
 
-def test_used_container_name_is_one_sentence(tmp_path: Path) -> None:
+def test_used_container_name_causes_one_sentence(tmp_path: Path) -> None:
     name = f"{ownership.run_name(tmp_path / 'run')}-network-2"
     with foreign_container(name):
         done = on_docker(tmp_path, **NO_VEHICLES)

@@ -147,7 +147,7 @@ def test_vehicles_send_heartbeats_while_time_is_paused(monkeypatch: pytest.Monke
         (["--gcs", "255.255.255.255:14550"], "255.255.255.255:14550 cannot be sent (Permission denied)"),
     ],
 )
-def test_invalid_ground_station_is_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+def test_invalid_ground_station_causes_one_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
     scenario = write_scenario(tmp_path, vehicles={"kind": "embedded"})
     done = harness("run", scenario, "--out", tmp_path / "run", *arguments)
     assert done.returncode == 2
@@ -156,7 +156,7 @@ def test_invalid_ground_station_is_one_sentence(arguments: list[str], sentence: 
 
 
 @pytest.mark.any_user
-def test_unreachable_ground_station_is_one_sentence(tmp_path: Path) -> None:
+def test_unreachable_ground_station_causes_one_sentence(tmp_path: Path) -> None:
     options = ["--out", tmp_path / "run", "--backend", "sim", "--gcs", "255.255.255.255:1"]
     done = harness("run", write_scenario(tmp_path), *options)
     assert done.returncode == 2

@@ -112,7 +112,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
 ]
 
 
-def test_impossible_request_is_one_sentence_and_changes_nothing(tmp_path: Path) -> None:
+def test_impossible_request_causes_one_sentence_and_changes_nothing(tmp_path: Path) -> None:
     strained = {"at_s": 90, "network": {"loss": 0.3, "delay": 0.1}, "for_s": 60}
     asked = scenario(duration_s=300, timeline=[strained, {"at_s": 200, "kill": [3]}])
     wrong: list[str] = []

@@ -112,7 +112,7 @@ def test_other_broadcast_does_not_use_the_channel() -> None:
     assert played.channel.totals.frames == 0
 
 
-def test_message_heard_after_its_time_is_sent_now() -> None:
+def test_message_received_after_its_time_is_sent_at_once() -> None:
     played = Played()
     assert played.arrivals(1.0) == []
     played.send(0.9, 2)

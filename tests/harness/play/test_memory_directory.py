@@ -51,7 +51,7 @@ def guard_of(directory: Path) -> int:
     raise AssertionError("no process guards the directory")
 
 
-def test_next_directory_removes_one_whose_processes_were_killed(killed: Path) -> None:
+def test_next_directory_removes_that_of_killed_processes(killed: Path) -> None:
     assert (killed / "bundle").exists()
     with memory_directory(PREFIX):
         assert not killed.exists()

@@ -113,7 +113,7 @@ def test_subswarms_split_the_network_and_reconcile_after_the_rejoin() -> None:
         ({"hard_range": {}, "update_s": 0}, r"network\.radio\.update_s"),
     ],
 )
-def test_invalid_radio_is_one_sentence(radio: dict[str, object], word: str, tmp_path: Path) -> None:
+def test_invalid_radio_causes_one_sentence(radio: dict[str, object], word: str, tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text(f"name: Range\nnetwork: {{radio: {radio}}}\n")
     with pytest.raises(ScenarioError, match=word):

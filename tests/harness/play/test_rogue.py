@@ -188,7 +188,7 @@ def test_sequence_numbers_identify_the_injection() -> None:
     assert forged_sequence(10_000, MAX_FLOOD) < 2**32
 
 
-def test_the_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_journal_has_a_line_for_each_datagram_and_counts_a_flood(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_journal, "LINES", 2)
     lines: list[dict[str, Any]] = []
     book = _journal.RogueJournal(lines.append)

@@ -190,7 +190,7 @@ def finished_traces(directory: Path) -> dict[int, list[dict[str, Any]]]:
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_rogue_node_that_dies_ends_the_run_as_a_failure_of_the_harness(tmp_path: Path) -> None:
+def test_death_of_the_rogue_node_ends_the_run_as_a_harness_failure(tmp_path: Path) -> None:
     keys = {"duration_s": 2000, "speedup": 20, "vehicles": {"kind": "none"}, "timeline": [FORGE]}
     running = Running(write_scenario(tmp_path, **keys), tmp_path / "run", "--seed", 1)
     running.wait_for_mission(1)
@@ -269,7 +269,7 @@ def test_dead_and_paused_agents_receive_rogue_datagrams_as_usual(tmp_path: Path)
         ),
     ],
 )
-def test_mistake_in_an_injection_is_one_sentence(entry: dict[str, Any], sentence: str) -> None:
+def test_mistake_in_an_injection_causes_one_sentence(entry: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ScenarioError) as error:
         parse({"name": "x", "agents": 5, "duration_s": 300, "timeline": [{"at_s": 100, **entry}]})
     assert sentence in str(error.value)

@@ -50,7 +50,7 @@ def test_different_chains_give_the_scenario_and_status_1(
     assert "1 scenarios with 2 seeds, 1 different" in output
 
 
-def test_invalid_scenario_file_is_one_sentence(
+def test_invalid_scenario_file_causes_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["secured_library", str(tmp_path / "nothing.yaml")])

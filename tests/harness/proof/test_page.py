@@ -84,7 +84,7 @@ def one_chain(proof: Proof) -> str:
 SMALL = [row for row in rows() if float((row.get("seconds") or row["processor seconds"]).replace(",", "")) <= MOST_S]
 
 
-def test_the_page_has_tables() -> None:
+def test_page_has_tables() -> None:
     assert len(SMALL) > 25
     assert {row["options"] for row in SMALL} == {"", " --no-crossing"}
 
@@ -108,7 +108,7 @@ def captured_rows() -> list[Row]:
     return [row for row in found if float(row["seconds"]) <= MOST_S]
 
 
-def test_the_page_has_quick_rows_of_captured_agents() -> None:
+def test_page_has_quick_rows_of_captured_agents() -> None:
     assert {row["network"] for row in captured_rows()} == {"lossless", "lossy", "any"}
 
 

@@ -80,7 +80,7 @@ def test_chain_that_ends_inside_another_has_its_oval_beside_the_block() -> None:
     assert sorted(texts(tree, "oval")) == ["1, 3", "2"]
 
 
-def test_the_same_block_after_different_histories_stands_on_both_branches() -> None:
+def test_block_after_different_histories_is_on_both_branches() -> None:
     tree = drawn({1: "1.1 2.1 3.1", 2: "1.1 3.1 2.1"})
     assert sorted(texts(tree, "block")) == ["1.1", "2.1", "2.1", "3.1", "3.1", "inception block"]
 
@@ -105,7 +105,7 @@ def test_long_stretch_is_abridged_with_the_number_of_hidden_blocks() -> None:
     assert len(ellipsis.nodes) == 29
 
 
-def test_a_stretch_whose_ellipsis_would_save_no_room_is_drawn_in_full() -> None:
+def test_short_stretch_is_drawn_without_ellipsis() -> None:
     most = 2 * KEPT_AT_EACH_END + FEWEST_HIDDEN - 1
     assert texts(drawn({1: [f"1.{n}" for n in range(1, most + 1)]}, abridged=True), "ellipsis") == []
     assert texts(drawn({1: [f"1.{n}" for n in range(1, most + 2)]}, abridged=True), "ellipsis") == ["3 blocks"]
@@ -220,7 +220,7 @@ def test_labels_of_the_largest_ids_fit_their_boxes() -> None:
             assert len(line) * CHARACTER_WIDTH < placed.width
 
 
-def test_the_majoritys_chain_goes_straight_up() -> None:
+def test_chain_of_the_majority_goes_straight_up() -> None:
     drawn = layout({1: "1.1 1.2", 2: "1.1 2.1 3.1", 3: "1.1 2.1 3.1", 4: "1.1 2.1", 5: "1.1"})
     trunk = {
         placed.x for placed in drawn.root.walk() if placed.mark.lines[0] in ("inception block", "1.1", "2.1", "3.1")
@@ -233,7 +233,7 @@ def test_five_branches_fit_a_phone() -> None:
     assert layout(chains).width <= 318
 
 
-def test_a_tree_of_ten_thousand_blocks_is_laid_out_in_seconds() -> None:
+def test_tree_of_ten_thousand_blocks_is_laid_out_in_seconds() -> None:
     chains = {agent: [f"{agent}.{n}" for n in range(1, 201)] for agent in range(1, 51)}
     read = exports(chains)
     started = time.process_time()
@@ -252,7 +252,7 @@ def titles(drawing: str) -> list[str]:
     return [element.text or "" for element in ElementTree.fromstring(drawing).iter(f"{SVG}title")]  # noqa: S314 - ours
 
 
-def test_the_file_is_valid_xml_and_refers_to_nothing() -> None:
+def test_file_is_valid_xml_without_references() -> None:
     drawing = picture({1: "1.1 2.1", 2: "1.1"}).standalone()
     assert ElementTree.fromstring(drawing).tag == f"{SVG}svg"  # noqa: S314 - ours
     assert set(re.findall(r"https?://[^\"']*", drawing)) == {"http://www.w3.org/2000/svg"}

@@ -48,7 +48,7 @@ def test_each_figure_has_a_story_and_the_page_names_it() -> None:
 
 
 @pytest.mark.parametrize("handler", HANDLERS.values(), ids=lambda handler: handler.name)
-def test_the_story_of_a_handler_takes_every_branch_of_its_figure(handler: EventHandler[...]) -> None:
+def test_story_of_a_handler_takes_every_branch_of_its_figure(handler: EventHandler[...]) -> None:
     text = (STORIES / f"figure_3_{handler.algorithm + 3:02}_{handler.name}.story").read_text()
     title = handler.title.partition(" ")[2]
     lines = re.findall(rf"^      [\d ]+ {handler.algorithm}  {title}[^:]*: (.*)$", text, re.MULTILINE)

@@ -69,7 +69,7 @@ def test_large_figures_stay_on_one_line(browser: Browser, tmp_path: Path) -> Non
         assert browser.evaluate(lines) == 1
 
 
-def test_the_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page: Path) -> None:
+def test_keyboard_unfolds_the_tree_and_folds_it_again(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(SHOWN.format("abridged"))
     assert not browser.evaluate(SHOWN.format("full"))
@@ -107,7 +107,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1280])
-def test_the_map_fits_the_screen_in_its_colours_and_the_console_is_silent(
+def test_map_fits_the_screen_in_its_colours_and_the_console_is_silent(
     browser: Browser, flown: Path, width: int, scheme: Literal["light", "dark"]
 ) -> None:
     browser.show(flown, width=width, scheme=scheme)
@@ -122,7 +122,7 @@ def test_the_map_fits_the_screen_in_its_colours_and_the_console_is_silent(
 
 
 @pytest.mark.parametrize(("required", "outcome"), [("", pytest.skip.Exception), ("lab,browser", pytest.fail.Exception)])
-def test_a_missing_browser_is_a_failure_only_where_one_is_required(
+def test_missing_browser_fails_only_where_one_is_required(
     monkeypatch: pytest.MonkeyPatch, required: str, outcome: type[BaseException]
 ) -> None:
     monkeypatch.setenv("PATH", "")

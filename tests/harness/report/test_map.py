@@ -78,7 +78,7 @@ def state(at_s: float, *components: set[int]) -> Topology:
     return Topology(at_s, "range", tuple(frozenset(component) for component in components))
 
 
-def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> None:
+def test_map_shows_the_parts_of_a_split_and_a_rejoin(tmp_path: Path) -> None:
     section = drawn(tmp_path)
     assert [which for _, which in section.legend] == ["connected to all others", "part A", "part B", "start", "end"]
     tracks = paths(section)
@@ -89,7 +89,7 @@ def test_a_split_and_a_rejoin_are_on_the_map_in_their_parts(tmp_path: Path) -> N
     assert all("connected to all others" in tip for which, tip, _ in tracks if which == "whole")
 
 
-def test_the_moments_are_begin_changes_and_end_with_the_live_links(tmp_path: Path) -> None:
+def test_maps_show_begin_changes_and_end_with_the_live_links(tmp_path: Path) -> None:
     section = drawn(tmp_path)
     (begin, apart, together, end) = said(section)
     assert begin == "0 s all 5 connected"
@@ -120,7 +120,7 @@ def test_each_type_of_vehicle_has_its_shape(tmp_path: Path) -> None:
     assert kinds[1] == kinds[4] and len(set(kinds.values())) == 3
 
 
-def test_a_known_track_gives_the_known_path(tmp_path: Path) -> None:
+def test_known_track_gives_the_known_path(tmp_path: Path) -> None:
     """A flight around a square of 200 m leads north, east, south and west. The map shows it as up, right, down and
     left.
     """
@@ -168,7 +168,7 @@ def test_track_changes_colour_at_the_interpolated_position(tmp_path: Path) -> No
     assert (before[0][1] - alone[-1][1]) / up == pytest.approx(0.5075, abs=0.001)
 
 
-def test_a_lost_vehicle_ends_in_a_cross_and_its_successor_begins_at_home(tmp_path: Path) -> None:
+def test_lost_vehicle_ends_in_a_cross_and_its_successor_begins_at_home(tmp_path: Path) -> None:
     timeline = [
         {"at_s": 50, "kill": [2]},
         {"at_s": 100, "restart": [2]},
@@ -340,7 +340,7 @@ def test_all_tracks_are_inside_the_map_with_a_margin(flown: list[tuple[float, fl
     assert 0.44 < land.width_m / land.height_m < 1 / 0.44
 
 
-def test_a_swarm_that_hardly_moves_is_not_blown_up() -> None:
+def test_swarm_that_hardly_moves_is_not_enlarged() -> None:
     land = extent([PositionFix(0, 0, 0), PositionFix(1, 0.5, 0)])
     assert land.width_m == land.height_m == pytest.approx(22)
 

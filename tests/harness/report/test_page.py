@@ -96,7 +96,7 @@ def test_page_lists_the_blocks_lost_with_vehicles(tmp_path: Path) -> None:
         assert "Survival" not in report(tmp_path / f"without {survival}", {"survival": survival}).text
 
 
-def test_a_violation_leads_and_its_evidence_is_complete(tmp_path: Path) -> None:
+def test_violation_comes_first_and_its_evidence_is_complete(tmp_path: Path) -> None:
     result = result_of([1, 2, 3])
     result["characteristics"]["3"] = {
         "name": "single copy",
@@ -112,7 +112,7 @@ def test_a_violation_leads_and_its_evidence_is_complete(tmp_path: Path) -> None:
     assert all(f"held {n}" in page.text for n in range(9))
 
 
-def test_the_page_is_one_file_that_refers_to_no_other(tmp_path: Path) -> None:
+def test_page_is_one_file_that_refers_to_no_other(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     before = {path.name for path in run_dir.iterdir()}
     html = write_report(RunArchive(run_dir)).read_text(encoding="utf-8")
@@ -128,7 +128,7 @@ def test_the_page_is_one_file_that_refers_to_no_other(tmp_path: Path) -> None:
     assert "script" not in {tag for tag, _ in page.elements}
 
 
-def test_the_security_policy_allows_the_pages_own_style_and_nothing_else(tmp_path: Path) -> None:
+def test_security_policy_allows_only_the_style_of_the_page(tmp_path: Path) -> None:
     page = report(tmp_path / "run")
     (policy,) = (a["content"] for tag, a in page.elements if tag == "meta" and a.get("http-equiv"))
     assert policy is not None
@@ -166,7 +166,7 @@ def test_hostile_texts_stay_text(tmp_path: Path) -> None:
     assert "<script" not in (tmp_path / "run" / "chains.svg").read_text(encoding="utf-8")
 
 
-def test_half_a_character_in_a_name_does_not_stop_the_report(tmp_path: Path) -> None:
+def test_invalid_character_in_a_name_does_not_stop_the_report(tmp_path: Path) -> None:
     assert "half ?" in report(tmp_path / "run", {"scenario": {"name": "half \ud83d"}}).text
 
 
@@ -178,7 +178,7 @@ def test_page_of_an_incomplete_run_gives_the_reason(tmp_path: Path, outcome: str
     assert headline == "headline unknown"
 
 
-def test_a_run_file_with_nothing_but_its_schema_is_shown(tmp_path: Path) -> None:
+def test_run_file_with_only_its_schema_is_shown(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     (run_dir / "run.json").write_text('{"schema": "ucp-run/1"}')
     page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
@@ -208,34 +208,34 @@ def test_page_explains_completed_blocks_that_are_in_no_chain() -> None:
     )
 
 
-def test_a_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
+def test_run_without_any_export_is_still_reported(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", {}, {"scenario": {"name": "all lost", "agents": 2}})
     page = Reader(write_report(RunArchive(run_dir)).read_text(encoding="utf-8"))
     assert "No chains: no agent" in page.text
     assert "agents 1, 2: no usable export" in page.text
 
 
-def test_a_chain_that_was_not_abridged_has_nothing_to_unfold(tmp_path: Path) -> None:
+def test_complete_chain_has_no_part_to_unfold(tmp_path: Path) -> None:
     page = report(tmp_path / "run")
     assert "input" not in {tag for tag, _ in page.elements}
 
 
 @pytest.mark.parametrize("content", [None, "", "{", "[]", "{}", '{"schema": "ucp-run/9"}', "[" * 100_000, "\udcff"])
-def test_a_directory_without_a_readable_result_is_refused_in_one_sentence(tmp_path: Path, content: str | None) -> None:
+def test_directory_without_readable_result_is_refused_in_one_sentence(tmp_path: Path, content: str | None) -> None:
     if content is not None:
         (tmp_path / "run.json").write_text(content, encoding="utf-8", errors="surrogateescape")
     with pytest.raises(RunDirectoryError, match=r"^[^\n]*(run\.json: |neither a run directory)[^\n]*$"):
         write_report(RunArchive(tmp_path))
 
 
-def test_the_cycle_collector_runs_again_afterwards(tmp_path: Path) -> None:
+def test_cycle_collector_runs_again_afterwards(tmp_path: Path) -> None:
     report(tmp_path / "run")
     with pytest.raises(RunDirectoryError):
         write_report(RunArchive(tmp_path))
     assert gc.isenabled()
 
 
-def test_a_report_that_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+def test_unwritable_report_is_refused_without_temporary_files(tmp_path: Path) -> None:
     run_dir = write_run(tmp_path / "run", CHAINS)
     (run_dir / "report.html").mkdir()
     with pytest.raises(RunDirectoryError, match=r"report\.html: cannot be written"):

@@ -63,7 +63,7 @@ def test_junit_file_has_a_test_case_for_each_characteristic(tmp_path: Path) -> N
     assert [case.get("name") for case in suite][::5] == ["1. distributed", "6. one uniform chain"]
 
 
-def test_a_violation_is_a_failure_with_its_evidence() -> None:
+def test_violation_is_a_failure_with_its_evidence() -> None:
     evidence = [{"agent_id": 2, "block": "2.1", "block_hash": None, "detail": f"held {count}"} for count in (2, 3)]
     found = cases(judged("3", verdict="violated", reason="2 times: a block is held twice", evidence=evidence))
     said = "violated: 2 times: a block is held twice"
@@ -163,7 +163,7 @@ def test_expected_figures_are_a_test_case() -> None:
         ),
     ],
 )
-def test_a_run_that_did_not_complete_fails_a_test_case_of_its_own(keys: dict[str, Any], said: str) -> None:
+def test_incomplete_run_fails_a_separate_test_case(keys: dict[str, Any], said: str) -> None:
     assert "run" not in cases(result_of([1]))
     inside = cases({**result_of([1]), **keys})["run"]
     assert inside is not None
@@ -203,7 +203,7 @@ def test_summary_of_a_run_fits_about_one_screen(tmp_path: Path) -> None:
     assert len(lines) < 40
 
 
-def test_a_violation_has_its_evidence_below_the_table(tmp_path: Path) -> None:
+def test_violation_has_its_evidence_below_the_table(tmp_path: Path) -> None:
     evidence = [{"agent_id": 2, "block": "2.1", "block_hash": None, "detail": f"held {count}"} for count in range(9)]
     judged = {"3": {"name": "single copy", "verdict": "violated", "reason": "9 times", "evidence": evidence}}
     lines = lines_of(tmp_path, {"characteristics": judged})

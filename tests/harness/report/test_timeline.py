@@ -88,7 +88,7 @@ def test_every_kind_of_mark_has_a_title_and_a_legend_entry(troubled: Path) -> No
         assert meaning in text
 
 
-def test_the_tables_have_every_vote_and_reconcile(troubled: Path) -> None:
+def test_tables_have_every_vote_and_reconcile(troubled: Path) -> None:
     page, result = Reader(html_of(troubled)), json.loads((troubled / "run.json").read_text())
     assert f"The {result['figures']['reconciles']} reconciles as a table" in page.text
     assert re.search(
@@ -106,7 +106,7 @@ def test_all_pictures_have_descriptions_and_identifiers_are_unique(troubled: Pat
     assert len(identifiers) == len(set(identifiers))
 
 
-def test_the_policy_allows_the_one_script_by_its_digest(troubled: Path) -> None:
+def test_policy_allows_the_one_script_by_its_digest(troubled: Path) -> None:
     html = html_of(troubled)
     (script,) = re.findall(r"<script>(.*?)</script>", html, re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -116,7 +116,7 @@ def test_the_policy_allows_the_one_script_by_its_digest(troubled: Path) -> None:
     assert not [key for _, attributes in Reader(html).elements for key in attributes if key.startswith("on")]
 
 
-def test_a_run_without_traces_has_neither_timeline_nor_script(tmp_path: Path) -> None:
+def test_run_without_traces_has_neither_timeline_nor_script(tmp_path: Path) -> None:
     html = html_of(write_run(tmp_path / "run", {1: "1.1"}))
     assert "Timeline" not in html
     assert "<script" not in html
@@ -201,7 +201,7 @@ def test_hostile_traces_make_no_markup_and_no_large_page(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("outcome", "end_s"), [("completed", 1200.0), ("running", 950.0), ("interrupted", 950.0)])
-def test_the_timeline_of_a_run_that_was_cut_short_ends_with_it(tmp_path: Path, outcome: str, end_s: float) -> None:
+def test_timeline_of_an_interrupted_run_ends_with_the_run(tmp_path: Path, outcome: str, end_s: float) -> None:
     lines = [a_line(950.0, "build_data_block", "building")]
     html = html_of(run_with(tmp_path, *lines, result={"outcome": outcome}))
     assert f'data-end="{end_s}"' in html
@@ -220,7 +220,7 @@ def test_template_style_and_script_are_in_the_package() -> None:
     assert {"timeline.html.j2", "timeline.css", "timeline.js"} <= shipped
 
 
-def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_path: Path) -> None:
+def test_swarm_in_an_endless_cycle_has_a_bracket_for_each_round(tmp_path: Path) -> None:
     directory = run(in_step(), 1, tmp_path / "run", SilentProgress(), backend="sim").directory
     page = html_of(directory)
     assert page.count('class="round"') == 13, (
@@ -231,7 +231,7 @@ def test_a_swarm_that_goes_round_in_circles_has_a_bracket_for_each_round(tmp_pat
     assert "repeats a cycle" in page
 
 
-def test_a_swarm_that_finishes_has_no_brackets(troubled: Path) -> None:
+def test_swarm_that_finishes_has_no_brackets(troubled: Path) -> None:
     assert 'class="round"' not in html_of(troubled)
 
 

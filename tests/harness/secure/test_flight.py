@@ -82,7 +82,7 @@ COMMANDS: list[tuple[Sequence[str], int, str]] = [
 @pytest.mark.parametrize(
     ("command", "status", "words"), COMMANDS, ids=lambda it: it[0] if isinstance(it, tuple) else ""
 )
-def test_command_prints_the_truth_and_no_secret(
+def test_command_prints_the_expected_words_and_no_secret(
     home: KeyDirectory, flown: Path, tmp_path: Path, command: Sequence[str], status: int, words: str
 ) -> None:
     bundle = str(home.directory.parent / "bundles/1.bundle.json")

@@ -30,7 +30,7 @@ def asked(directory: Path, **keys: Any) -> Scenario:
     return scenario(agents=ROSTER, duration_s=200, security={"keys": str(directory)}, **{**REVOKED, **keys})
 
 
-def test_the_home_of_the_keys_revokes_and_stays_as_it_was(home: KeyDirectory, tmp_path: Path) -> None:
+def test_revocation_by_a_run_does_not_change_the_key_directory(home: KeyDirectory, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in home.directory.iterdir()}
     path = tmp_path / "asked.yaml"
     path.write_text(json.dumps(asked(home.directory).model_dump(mode="json", exclude_defaults=True)))

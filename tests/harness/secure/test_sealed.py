@@ -74,7 +74,7 @@ def swarm(tmp_path_factory: pytest.TempPathFactory) -> SealedSwarm:
     return SealedSwarm(tmp_path_factory.mktemp("sealed"))
 
 
-def test_others_carry_it_and_cannot_read_it(swarm: SealedSwarm) -> None:
+def test_other_agents_store_sealed_events_and_cannot_read_them(swarm: SealedSwarm) -> None:
     chains = [[block["block_hash"] for block in export["chain"]] for export in swarm.exports.values()]
     assert chains[0] == chains[1] == chains[2] and len(chains[0]) >= 3
     for export in swarm.exports.values():
@@ -100,7 +100,7 @@ def test_trace_shows_the_events_of_its_own_vehicle_only(swarm: SealedSwarm) -> N
         assert {other for other in ROSTER if logged[other] in content} == {agent_id}
 
 
-def test_the_judge_follows_agents_that_seal(swarm: SealedSwarm) -> None:
+def test_checker_accepts_agents_that_seal_events(swarm: SealedSwarm) -> None:
     judgement = steps.check(swarm.evidence())
     assert judgement.verdict == "as specified", judgement
 
@@ -133,7 +133,7 @@ def test_chains_report_encrypted_events_and_the_depot_key_decrypts_them(swarm: S
     )
 
 
-def test_a_consolidated_record_has_the_events_once_the_depot_opens_them(swarm: SealedSwarm, tmp_path: Path) -> None:
+def test_merged_record_has_events_after_the_depot_decrypts_them(swarm: SealedSwarm, tmp_path: Path) -> None:
     closed = harness("consolidate", swarm.directory, "--out", tmp_path / "closed.jsonl")
     assert closed.returncode == 0
     assert "sealed to the depot" in closed.stdout

@@ -117,7 +117,7 @@ def test_signatures_without_keys_prove_nothing(home: Path) -> None:
     assert genuine(home)["verdict"] == "not applicable"
 
 
-def test_run_without_its_public_keys_is_not_vouched_for(run: Path, tmp_path: Path) -> None:
+def test_run_without_its_public_keys_is_not_confirmed(run: Path, tmp_path: Path) -> None:
     whole = shutil.copytree(run, tmp_path / "whole")
     assert genuine(whole)["reason"].endswith("with the public keys that run.json names")
     (whole / "public.json").unlink()
@@ -312,20 +312,20 @@ EDITS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
 
 
 @pytest.mark.parametrize(("edit", "sentence"), EDITS)
-def test_an_edited_export_is_found(home: Path, edit: Callable[[dict[str, Any]], Any], sentence: str) -> None:
+def test_edited_export_is_found(home: Path, edit: Callable[[dict[str, Any]], Any], sentence: str) -> None:
     judgement = edited(home, edit)
     assert judgement["verdict"] == "violated"
     assert any(sentence in finding["detail"] for finding in judgement["evidence"]), judgement
 
 
-def test_a_sealed_run_has_no_event_in_its_blocks(run: Path) -> None:
+def test_sealed_run_has_no_event_in_its_blocks(run: Path) -> None:
     done = harness("chain", run)
     assert "sealed to the depot" in done.stdout
     export = json.loads((run / "agents/1.chain.json").read_text())
     assert max(len(base64.b64decode(block["event_data"])) for block in export["chain"]) <= 1024
 
 
-def test_an_import_takes_the_public_keys_of_its_flight_along(home: Path, tmp_path: Path) -> None:
+def test_import_includes_the_public_keys_of_its_flight(home: Path, tmp_path: Path) -> None:
     others = {**json.loads((home / "public.json").read_text()), "mission": "00" * 16}
     (home / "others.json").write_text(json.dumps(others))
     (home / "broken.json").write_text(json.dumps({**others, "mission": "no"}))

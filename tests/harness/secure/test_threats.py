@@ -17,7 +17,7 @@ def test_each_attack_has_the_result_in_the_table(row: Row) -> None:
     assert line in PAGE
 
 
-def test_the_table_has_these_rows_alone() -> None:
+def test_table_has_only_the_tested_rows() -> None:
     written = PAGE.split("<!-- table: begin -->")[1].split("<!-- table: end -->")[0]
     assert len(written.strip().splitlines()) == 2 + len(ROWS)
 

@@ -92,7 +92,7 @@ def test_station_draws_a_backoff_after_its_own_frame() -> None:
     assert max(starts) == pytest.approx(1.0 + AIRTIME_S + DIFS_S + 31 * 20e-6, abs=1e-9)
 
 
-def test_station_counts_down_after_its_frame_while_it_has_no_other() -> None:
+def test_station_counts_down_after_its_frame_without_another_frame() -> None:
     _, second = sent(QUIET, [0, 10], (0, 1.0), (0, 1.0 + AIRTIME_S + DIFS_S + 31 * 20e-6))
     assert second.began_at == second.queued_at
 

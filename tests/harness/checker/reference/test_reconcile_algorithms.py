@@ -194,7 +194,7 @@ def test_unknown_chain_hash_begins_a_reconcile() -> None:
     ]
 
 
-def test_vote_runs_on_when_a_query_begins_a_reconcile() -> None:
+def test_vote_continues_when_a_query_begins_a_reconcile() -> None:
     agent = new_agent()
     complete(agent)
     agent.receive(2, ChainHashSuccessorQuery(OTHER_HASH), 1.0)

@@ -115,7 +115,7 @@ def test_agents_on_two_workers_are_judged_as_on_one_machine(tmp_path: Path, host
         assert abs(lost / sent - 0.15) < 4 * (0.15 * 0.85 / sent) ** 0.5, counted
 
 
-def test_lost_worker_cuts_off_its_agents_and_the_run_goes_on(tmp_path: Path, hosts: Hosts) -> None:
+def test_lost_worker_cuts_off_its_agents_and_the_run_continues(tmp_path: Path, hosts: Hosts) -> None:
     hosts.start("one")
     doomed = hosts.start("two")
     out = tmp_path / "run"

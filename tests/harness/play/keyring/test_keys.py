@@ -42,7 +42,7 @@ def test_other_users_cannot_read_secret_files(made: Path) -> None:
     assert {*modes.values()} == {0o600}
 
 
-def test_a_bundle_has_the_secrets_of_one_vehicle(made: Path) -> None:
+def test_bundle_has_the_secrets_of_one_vehicle(made: Path) -> None:
     text = (made.parent / "bundles/7.bundle.json").read_text()
     authority, depot, group_secret, first, seventh, last = secrets(made)
     assert group_secret in text and seventh in text

@@ -242,7 +242,7 @@ def test_new_secret_can_be_read_by_its_owner_only(tmp_path: Path) -> None:
         create_secret(path)
 
 
-def test_unusable_secret_files_are_refused_with_a_way_out(tmp_path: Path) -> None:
+def test_unusable_secret_files_are_refused_with_a_solution(tmp_path: Path) -> None:
     path = tmp_path / "lab.key"
     with pytest.raises(SecretError, match="--new-secret"):
         read_secret(path)

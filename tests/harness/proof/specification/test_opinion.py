@@ -78,7 +78,7 @@ def test_misprints_of_the_thesis_are_rejected_by_both() -> None:
     assert opinion.exit_status == 1
 
 
-def test_a_wrong_specification_has_other_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_specification_has_other_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path in tlc.MODULES.glob("*.tla"):
         shutil.copy(path, tmp_path)
     protocol = tmp_path / "UCP.tla"
@@ -93,7 +93,7 @@ def test_a_wrong_specification_has_other_states(tmp_path: Path, monkeypatch: pyt
     assert opinion.exit_status == 1
 
 
-def test_the_command_says_it(tmp_path: Path) -> None:
+def test_command_compares_the_proof_with_tlc(tmp_path: Path) -> None:
     done = harness("prove", "--agents", "1", "--blocks", "1", "--second-opinion", "--json")
     assert done.returncode == 0
     document = json.loads(done.stdout)

@@ -41,14 +41,14 @@ def validation() -> TraceValidation:
     return validate([*right, *wrong])
 
 
-def test_right_agents_do_what_is_specified(validation: TraceValidation) -> None:
+def test_only_wrong_agents_deviate_from_the_specification(validation: TraceValidation) -> None:
     assert not validation.unread
     assert validation.runs == 3 + len(WRONG)
     assert validation.steps > 1000
     assert {rejected.run for rejected in validation.rejected} == WRONG.keys()
 
 
-def test_a_wrong_agent_is_rejected_with_line_and_handler(validation: TraceValidation) -> None:
+def test_wrong_agent_is_rejected_with_line_and_handler(validation: TraceValidation) -> None:
     for rejected in validation.rejected:
         assert f"line {rejected.line}, Algorithm {WRONG[rejected.run]}, " in rejected.in_words()
         assert rejected.line > 1
@@ -78,7 +78,7 @@ def test_incomplete_exploration_does_not_hold() -> None:
     assert TraceValidation(1).exit_status == 2
 
 
-def test_an_interrupt_leaves_what_came_before() -> None:
+def test_interrupt_keeps_all_earlier_results() -> None:
     def runs() -> Iterator[RunTraces]:
         yield RunTraces("first", [], problems=["no traces found"])
         raise KeyboardInterrupt
@@ -90,7 +90,7 @@ def test_an_interrupt_leaves_what_came_before() -> None:
 
 
 @pytest.mark.lab
-def test_agents_that_are_processes_do_what_is_specified(tmp_path: Path) -> None:
+def test_agents_as_processes_follow_the_specification(tmp_path: Path) -> None:
     out = tmp_path / "run"
     done = harness("run", write_scenario(tmp_path, network={"loss": 0.2}), "--seed", 3, "--out", out)
     assert done.returncode in (0, 1), done.stdout + done.stderr

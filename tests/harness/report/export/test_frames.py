@@ -27,7 +27,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> RunArchive:
     return RunArchive(run(load_scenario("loss_15"), 7, directory, backend="sim").directory)
 
 
-def test_table_of_handler_runs_has_each_one(archive: RunArchive, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_of_handler_runs_is_complete(archive: RunArchive, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = handler_runs_frame(archive)
     assert whole.height == sum(len(trace.runs) for trace in archive.traces.values())
     first = archive.traces[3].runs[5]

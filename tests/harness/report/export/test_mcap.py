@@ -69,7 +69,7 @@ def test_every_handler_run_is_exported_at_its_mission_second(run: Path, messages
         ]
 
 
-def test_the_chain_can_be_plotted(run: Path, messages: Messages) -> None:
+def test_chain_can_be_plotted(run: Path, messages: Messages) -> None:
     lengths = [value["chain"] for _, value in messages["/agents/1/state"]]
     assert lengths[-1] == len(RunArchive(run).exports.by_agent[1].chain) > 3
     assert messages["/agents/1/chain"][-1][1]["length"] == lengths[-1]
@@ -96,7 +96,7 @@ def test_vehicles_are_on_the_map_and_in_the_3d_view(run: Path, messages: Message
     assert {"vehicle_1", "vehicle_2", "vehicle_3", "links"} == {entity.id for entity in drawn}
 
 
-def test_links_lose_what_the_network_loses_and_everything_where_it_is_cut(messages: Messages) -> None:
+def test_link_has_the_loss_of_the_network_or_1_if_it_is_cut(messages: Messages) -> None:
     losses: dict[str, float] = {}
     at_75_s: dict[str, float] = {}
     for at_ns, value in messages["/network/losses"]:
@@ -182,7 +182,7 @@ def test_damaged_run_is_exported_and_the_damage_is_reported(copy: Path, tmp_path
     assert any(name == "export" and "1.trace.jsonl" in text for _, name, text in lines)
 
 
-def test_a_flight_from_the_field_is_exported(run: Path, tmp_path: Path) -> None:
+def test_flight_from_the_field_is_exported(run: Path, tmp_path: Path) -> None:
     imported = harness("import", *sorted((run / "agents").glob("*.json*")), "--out", tmp_path / "field")
     assert imported.returncode == 0, imported.stderr
     exported = harness("export", tmp_path / "field", "--mcap", tmp_path / "field.mcap")

@@ -42,7 +42,7 @@ def chains_of(feed_changes: list[Change]) -> dict[int, list[str]]:
     return chains
 
 
-def test_a_film_ends_with_the_chains_that_the_agents_exported(run: Path) -> None:
+def test_film_ends_with_the_exported_chains(run: Path) -> None:
     feed_changes = film(run)
     exports = RunArchive(run).exports.by_agent
     assert chains_of(feed_changes) == {

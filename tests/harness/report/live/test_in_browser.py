@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 CHAINS = "Object.fromEntries([...watch.playhead.swarm.agents].map(([id, agent]) => [id, agent.chain]))"
 
 
-def test_a_film_plays_forward_and_back_and_takes_names_as_text(browser: Browser, run: Path) -> None:
+def test_film_plays_forward_and_back_and_escapes_names(browser: Browser, run: Path) -> None:
     with page_of("watch", run) as (process, address):
         for scheme, width in (("dark", 390), ("light", 1280)):
             browser.show(address, width=width, scheme=scheme)  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ def test_a_film_plays_forward_and_back_and_takes_names_as_text(browser: Browser,
         assert process.wait(DEADLINE_S) == 0
 
 
-def test_keyboard_does_what_the_mouse_does(browser: Browser, run: Path) -> None:
+def test_keyboard_has_all_functions_of_the_mouse(browser: Browser, run: Path) -> None:
     with page_of("watch", run) as (_, address):
         browser.show(address, width=1280, scheme="light")
         until(browser, "watch.story.end")

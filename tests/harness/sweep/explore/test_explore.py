@@ -77,7 +77,7 @@ def test_lowest_seed_is_found_and_shrunk_by_any_number_of_processes(tmp_path: Pa
     assert len(texts) == 1
 
 
-def test_a_real_violation_is_played_again_from_the_file(tmp_path: Path) -> None:
+def test_real_violation_is_played_again_from_the_file(tmp_path: Path) -> None:
     asked = scenario(agents=5, duration_s=600, network={"loss": 0.3}, quirks={"crash_on_tie": True})
     explored = find(tmp_path / "tie.yaml", asked, judge=simulated)
     assert explored.searched.violation is not None
@@ -159,7 +159,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     assert out.read_text() == "mine"
 
 
-def test_a_message_that_a_fate_drops_is_no_full_connectivity() -> None:
+def test_message_dropped_by_a_fate_breaks_full_connectivity() -> None:
     dropped = [{"message": "Chain Contain Response", "receiver": 2, "from_s": 0, "until_s": 900, "drop": True}]
     events = {"source": "scripted", "script": [{"at_s": at, "agent": 1 + at % 2} for at in range(1, 800, 7)]}
     asked = scenario(agents=3, duration_s=800, events=events, fates=dropped, quirks={"ignore_commit": 0.5})
@@ -195,7 +195,7 @@ def test_ctrl_c_ends_the_command_with_the_smallest_so_far(tmp_path: Path) -> Non
     assert load_scenario(out).events.source == "scripted"
 
 
-def test_the_command_without_a_violation_is_status_0(tmp_path: Path) -> None:
+def test_command_without_a_violation_ends_with_status_0(tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text("name: quiet\nagents: 3\nduration_s: 100\n")
     done = harness("explore", path, "--seeds", 3, "--first-seed", 5, "--jobs", 1, "--out", tmp_path / "none.yaml")
@@ -203,7 +203,7 @@ def test_the_command_without_a_violation_is_status_0(tmp_path: Path) -> None:
     assert done.stdout == "3 seeds played: no characteristic is violated\n"
 
 
-def test_a_scenario_that_needs_real_processes_is_status_2(tmp_path: Path) -> None:
+def test_scenario_that_needs_real_processes_ends_with_status_2(tmp_path: Path) -> None:
     path = tmp_path / "scenario.yaml"
     path.write_text("name: real\nvehicles: {kind: ardupilot}\n")
     done = harness("explore", path, "--out", tmp_path / "none.yaml")

@@ -294,7 +294,7 @@ def test_hostile_files_are_left_out_with_a_sentence(tmp_path: Path) -> None:
     assert (directory / "runs" / "mine.txt").read_text() == "mine"
 
 
-def test_a_corpus_is_of_one_scenario_and_of_one_command(tmp_path: Path) -> None:
+def test_corpus_accepts_one_scenario_and_one_command(tmp_path: Path) -> None:
     limits, _ = initial_documents(ordinary(), range(1))
     corpus = opened(tmp_path / "corpus", ordinary(), limits)
     with pytest.raises(RunDirectoryError, match="another command works"):
@@ -333,7 +333,7 @@ def test_ctrl_c_keeps_findings(tmp_path: Path) -> None:
         (["--corpus", "there"], "--corpus and --json need a hunt"),
     ],
 )
-def test_wrong_options_are_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
+def test_wrong_options_cause_one_sentence(tmp_path: Path, arguments: list[str], said: str) -> None:
     path = tmp_path / "ordinary.yaml"
     path.write_text(json.dumps(ORDINARY))
     done = harness("explore", path, *arguments)

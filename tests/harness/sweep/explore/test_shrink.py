@@ -58,7 +58,7 @@ def test_nothing_is_tried_twice() -> None:
     assert it.runs == 1
 
 
-def test_the_number_of_runs_is_bounded_and_the_best_so_far_stays() -> None:
+def test_limit_of_runs_ends_the_search_and_keeps_the_best_scenario() -> None:
     it = shrinker(max_runs=9)
     with pytest.raises(BudgetSpentError):
         shrink(it)

@@ -56,7 +56,7 @@ def test_killed_worker_loses_no_task_and_duplicates_none(tmp_path: Path, dask: C
         assert (out / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_lost_scheduler_is_one_sentence_and_the_matrix_can_continue(tmp_path: Path, dask: Cluster) -> None:
+def test_lost_scheduler_causes_one_sentence_and_the_matrix_can_continue(tmp_path: Path, dask: Cluster) -> None:
     address = dask.start_scheduler()
     dask.start_worker(address, "one")
     asked, out = written(tmp_path), tmp_path / "out"
@@ -84,13 +84,13 @@ def refused(address: str) -> str:
     return str(error.value)
 
 
-def test_a_scheduler_without_workers_is_one_sentence(dask: Cluster) -> None:
+def test_scheduler_without_workers_causes_one_sentence(dask: Cluster) -> None:
     address = dask.start_scheduler()
     assert refused(address) == (f"the scheduler at {address} has no workers: start some with `dask worker {address}`")
 
 
 @pytest.mark.parametrize("package", ["ucp_harness", "distributed"])
-def test_a_scheduler_of_another_version_is_one_sentence(tmp_path: Path, dask: Cluster, package: str) -> None:
+def test_scheduler_of_another_version_causes_one_sentence(tmp_path: Path, dask: Cluster, package: str) -> None:
     installed = tmp_path / f"{package}-0.0.1.dist-info"
     installed.mkdir()
     (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.0.1\n")
@@ -103,7 +103,7 @@ def test_a_scheduler_of_another_version_is_one_sentence(tmp_path: Path, dask: Cl
     assert sentence.endswith(": install the same version on both")
 
 
-def test_no_scheduler_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_scheduler_causes_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.5)
     with socket.socket() as nobody_listens:
         nobody_listens.bind(("127.0.0.1", 0))

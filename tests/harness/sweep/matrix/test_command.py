@@ -24,7 +24,7 @@ def written(directory: Path, **keys: Any) -> Path:
     return path
 
 
-def test_a_matrix_ends_in_a_table_and_files(tmp_path: Path) -> None:
+def test_matrix_ends_with_a_table_and_files(tmp_path: Path) -> None:
     done = harness("matrix", written(tmp_path), "--backend", "sim", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stdout + done.stderr
     assert not sentences(done.stderr)
@@ -81,7 +81,7 @@ def test_standard_output_contains_only_json(tmp_path: Path) -> None:
         ({"scenario": {"agent_command": ["./agent"]}}, "`agent_command`: ./agent is not a program"),
     ],
 )
-def test_a_wrong_request_is_one_sentence_and_status_2(tmp_path: Path, keys: dict[str, Any], sentence: str) -> None:
+def test_wrong_request_causes_one_sentence_and_status_2(tmp_path: Path, keys: dict[str, Any], sentence: str) -> None:
     done = harness("matrix", written(tmp_path, **keys), "--out", tmp_path / "out")
     assert done.returncode == 2
     (said,) = sentences(done.stderr)
@@ -134,7 +134,7 @@ def test_against_compares_with_an_earlier_night(tmp_path: Path) -> None:
 @pytest.mark.lab
 @pytest.mark.parametrize("keep", ["violated", "all"])
 @pytest.mark.any_user
-def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path, keep: str) -> None:
+def test_matrix_of_processes_keeps_the_requested_run_directories(tmp_path: Path, keep: str) -> None:
     scenario = {"agents": 2, "duration_s": 60, "speedup": 60, "vehicles": {"kind": "none"}}
     asked = written(tmp_path, scenario=scenario, loss=[0.0], seeds=2, backend="process", keep=keep)
     done = harness("matrix", asked, "--out", tmp_path / "out")
@@ -148,7 +148,7 @@ def test_processes_fly_a_matrix_and_leave_what_the_file_asks_for(tmp_path: Path,
 
 @pytest.mark.lab
 @pytest.mark.any_user
-def test_a_run_whose_agent_crashes_is_a_result_and_is_kept(tmp_path: Path) -> None:
+def test_run_with_a_crashed_agent_is_a_result_and_is_kept(tmp_path: Path) -> None:
     agent = tmp_path / "agent"
     agent.write_text("#!/bin/sh\nexit 7\n")
     agent.chmod(0o755)
@@ -198,7 +198,7 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     assert "is not empty: choose another --out" in sentences(done.stderr)[0]
 
 
-def test_ctrl_c_keeps_what_is_finished_and_leaves_no_process(tmp_path: Path) -> None:
+def test_ctrl_c_keeps_finished_runs_and_leaves_no_process(tmp_path: Path) -> None:
     matrix = written(tmp_path, seeds=10_000)
     out = tmp_path / "out"
     with subprocess.Popen(

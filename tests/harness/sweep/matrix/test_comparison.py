@@ -65,7 +65,7 @@ def test_figure_without_an_interval_is_not_compared() -> None:
     assert not list(compare([cell(uniform=Estimate(n=0))], [cell(uniform=at(0.0))]))
 
 
-def test_a_figure_that_only_one_night_has_is_not_compared() -> None:
+def test_figure_of_only_one_night_is_not_compared() -> None:
     without = cell()
     del without.estimates["reconciles"]
     assert not list(compare([without], [cell(reconciles=at(5))]))
@@ -96,7 +96,7 @@ def tonight(baseline: Path, judged: Any = judge) -> Finished:
     return compare_with(played(asked, 1, judged), record)
 
 
-def test_the_same_night_again_is_no_regression(tmp_path: Path) -> None:
+def test_same_night_again_is_no_regression(tmp_path: Path) -> None:
     record = tonight(night(tmp_path / "before")).record
     assert record.against is not None
     assert not record.against.changes
@@ -247,7 +247,7 @@ def test_invalid_baseline_is_refused(tmp_path: Path, content: str | None, senten
     assert error.value.exit_status == 2
 
 
-def test_an_interrupted_night_is_no_baseline(tmp_path: Path) -> None:
+def test_interrupted_night_is_no_baseline(tmp_path: Path) -> None:
     path = night(tmp_path / "before")
     path.write_text(json.dumps({**json.loads(path.read_text()), "outcome": "interrupted"}))
     with pytest.raises(ScenarioError, match="contains results of a matrix that was interrupted"):

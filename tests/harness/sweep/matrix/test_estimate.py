@@ -16,7 +16,7 @@ def test_student_quantile_equals_the_published_table(degrees: int, expected: flo
     assert student_quantile(0.975, degrees) == pytest.approx(expected, abs=1e-7)
 
 
-def test_a_mean_has_students_interval() -> None:
+def test_mean_has_students_interval() -> None:
     estimate = estimate_mean([4.0, 5.0, 6.0, 7.0])
     margin = 3.1824463 * math.sqrt(5 / 3) / 2
     assert (estimate.n, estimate.mean) == (4, 5.5)
@@ -33,7 +33,7 @@ def test_equal_values_have_an_interval_without_width() -> None:
     [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0), (5, 10, 0.2366, 0.7634), (81, 263, 0.2553, 0.3662),
      (200, 200, 0.9812, 1.0)],
 )  # fmt: skip
-def test_a_share_has_wilsons_interval(count: int, n: int, low: float, high: float) -> None:
+def test_share_has_wilsons_interval(count: int, n: int, low: float, high: float) -> None:
     estimate = estimate_share(count, n)
     assert estimate.mean == count / n
     assert (estimate.low, estimate.high) == (pytest.approx(low, abs=5e-5), pytest.approx(high, abs=5e-5))

@@ -277,7 +277,7 @@ def test_page_has_the_tables_of_a_matrix() -> None:
     assert len({line.count("|") for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
-def test_growth_in_the_record_names_what_each_law_holds_for() -> None:
+def test_growth_in_the_record_names_the_scope_of_each_law() -> None:
     laws = json.loads(played_record(sizes(lengths=(600,))).model_dump_json())["growths"]
     assert {(law["backend"], law["loss"], law["duration_s"], law["agents"]) for law in laws} == {
         ("sim", 0.15, 600, None)
@@ -289,7 +289,7 @@ BOTH: list[Variable] = ["agents", "blocks"]
 
 
 @pytest.mark.parametrize("exponent", [-1.0, 0.0, 0.5, 1.0, 2.0, 3.3])
-def test_a_law_without_noise_is_found_as_it_is(exponent: float) -> None:
+def test_law_without_noise_is_found_exactly(exponent: float) -> None:
     law = fit(AGENTS, [([n], 0.7 * n**exponent) for n in (5, 10, 20, 50, 200)])
     assert law
     found = law.exponents["agents"]
@@ -309,7 +309,7 @@ def test_fit_separates_two_variables() -> None:
 
 
 @pytest.mark.parametrize("variables", [AGENTS, BOTH])
-def test_in_noise_nineteen_intervals_of_twenty_hold_the_exponent(variables: list[Variable]) -> None:
+def test_nineteen_of_twenty_intervals_contain_the_exponent_of_noisy_data(variables: list[Variable]) -> None:
     random = Random(1)
     trials, held = 400, 0
     for _ in range(trials):
@@ -324,7 +324,7 @@ def test_in_noise_nineteen_intervals_of_twenty_hold_the_exponent(variables: list
     assert 0.91 <= held / trials <= 0.99
 
 
-def test_the_interval_is_that_of_a_worked_example() -> None:
+def test_interval_equals_that_of_a_worked_example() -> None:
     """The logarithms are x = 1 to 5 and y = 2, 4, 5, 4, 5. The slope is 0.6, the standard error sqrt(0.08), and t is
     3.1824.
     """

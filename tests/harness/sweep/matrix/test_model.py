@@ -24,7 +24,7 @@ def written(directory: Path, **keys: Any) -> Path:
     return path
 
 
-def test_the_thesis_matrix_has_the_rates_of_section_4_2() -> None:
+def test_thesis_matrix_has_the_rates_of_section_4_2() -> None:
     matrix = load_matrix(THESIS)
     assert matrix.loss == [0.0, 0.1, 0.15, 0.25, 0.3, 0.5, 0.75, 1.0]
     assert matrix.seed_list == list(range(1, 201))
@@ -52,7 +52,7 @@ def test_each_cell_has_the_scenario_with_its_loss(tmp_path: Path) -> None:
     assert cell.agents == 3
 
 
-def test_a_scenario_may_stand_in_a_file_of_its_own(tmp_path: Path) -> None:
+def test_scenario_may_be_in_a_separate_file(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text("name: base\nagents: 7")
     matrix = load_matrix(written(tmp_path, scenario="base.yaml"))
     assert (matrix.scenario.name, matrix.scenario.agents) == ("base", 7)
@@ -89,7 +89,7 @@ def test_growth_needs_three_values_of_an_axis(tmp_path: Path) -> None:
     assert (three.grows_with_agents, three.grows_with_length, three.grows) == (False, True, True)
 
 
-def test_an_axis_may_be_one_value(tmp_path: Path) -> None:
+def test_axis_may_be_one_value(tmp_path: Path) -> None:
     asked = load_matrix(written(tmp_path, scenario={}, agents=7, duration_s=60, backend="process"))
     assert (asked.agents, asked.duration_s, asked.backend) == ([7], [60], ["process"])
 
@@ -100,7 +100,7 @@ def test_without_the_axis_agents_are_the_scenarios(tmp_path: Path) -> None:
     assert asked.scenario_at(asked.points[1]).roster == (7, 9)
 
 
-def test_a_scenario_in_a_file_of_its_own_leaves_the_axis_alone(tmp_path: Path) -> None:
+def test_separate_scenario_file_must_not_set_the_axis(tmp_path: Path) -> None:
     base = tmp_path / "base.yaml"
     base.write_text("name: base")
     assert load_matrix(written(tmp_path, scenario="base.yaml", agents=[2, 4])).scenario.agents == 2
@@ -109,7 +109,7 @@ def test_a_scenario_in_a_file_of_its_own_leaves_the_axis_alone(tmp_path: Path) -
         load_matrix(written(tmp_path, scenario="base.yaml", agents=[2, 4]))
 
 
-def test_a_mistake_in_that_file_names_it(tmp_path: Path) -> None:
+def test_mistake_in_a_separate_scenario_file_names_the_file(tmp_path: Path) -> None:
     (tmp_path / "base.yaml").write_text("name: base\nagents: 0")
     with pytest.raises(ScenarioError, match=r"base\.yaml: `agents`"):
         load_matrix(written(tmp_path, scenario="base.yaml"))

@@ -61,7 +61,7 @@ def test_only_the_last_nights_are_read(tmp_path: Path, monkeypatch: pytest.Monke
     assert [one.started_at[8:10] for one in nights.read(tmp_path, matrix()).records] == ["03", "04"]
 
 
-def test_a_place_that_cannot_be_a_directory_is_refused(tmp_path: Path) -> None:
+def test_path_of_a_file_is_refused_as_directory(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RunDirectoryError, match=r"cannot be created: .*; choose another --nights"):
         nights.opened(tmp_path / "file")

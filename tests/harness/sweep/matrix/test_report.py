@@ -75,7 +75,7 @@ def test_violations_and_failures_are_marked_for_every_figure() -> None:
         assert "1 violated, 1 failed" in bad.in_words
 
 
-def test_a_figure_that_became_worse_is_marked_where_it_is_shown() -> None:
+def test_worse_figure_is_marked_where_it_is_shown() -> None:
     finished = played(matrix(), 1, judge)
     baseline = json.loads(json.dumps(finished.record.to_json()))
     for run in baseline["results"]:
@@ -102,7 +102,7 @@ def test_unplayed_cells_are_empty_and_partial_cells_are_marked() -> None:
     assert "This matrix was interrupted: 2 of 8 runs had ended." in to_html(finished, Path())
 
 
-def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
+def test_bad_runs_of_a_cell_come_first() -> None:
     well, bad = _drilldown.drilldown(played(matrix(), 1, breaks), Path())
     assert [row.seed for row in well.rows] == [1, 2, 3, 4]
     assert [row.seed for row in bad.rows] == [3, 2, 1, 4]
@@ -113,7 +113,7 @@ def test_the_runs_of_a_cell_begin_with_those_that_went_wrong() -> None:
     assert bad.runs == "4 runs, 1 with violations, 1 failed"
 
 
-def test_a_run_that_was_kept_leads_to_its_report(tmp_path: Path) -> None:
+def test_kept_run_links_to_its_report(tmp_path: Path) -> None:
     finished = played(matrix(seeds=2), 1, judge)
     runs = [run.model_copy(update={"backend": "process"}) for run in finished.runs]
     kept = tmp_path / "runs" / directory_name(runs[1].task)
@@ -130,7 +130,7 @@ def test_runs_above_the_limit_are_counted(monkeypatch: pytest.MonkeyPatch) -> No
     assert "runs.csv has 2 more runs." in to_html(finished, Path())
 
 
-def test_the_trend_has_a_panel_for_each_loss_and_a_dot_for_each_night() -> None:
+def test_trend_has_a_panel_for_each_loss_and_a_dot_for_each_night() -> None:
     finished = played(matrix(agents=[5, 10]), 1, judge)
     page = to_html(finished, Path(), over(finished, 3))
     (drawings,) = re.findall(
@@ -164,7 +164,7 @@ def test_trend_begins_with_the_second_night_and_the_page_explains_it() -> None:
     assert "The trend needs" not in to_html(finished, Path(), over(finished, 2))
 
 
-def test_absurd_nights_are_drawn_without_their_absurdity() -> None:
+def test_nights_with_absurd_figures_are_drawn_without_these_figures() -> None:
     finished = played(matrix(), 1, judge)
     nights = over(finished, 2)
     for value in (1e308, -1e308, 0.0, 1e-300):
@@ -267,7 +267,7 @@ def test_cells_without_all_their_runs_are_skipped() -> None:
     assert "**2 runs of 8, interrupted; no violations**" in to_markdown(finished.record)
 
 
-def test_the_summary_is_a_markdown_table_with_what_went_wrong_below() -> None:
+def test_summary_is_a_markdown_table_followed_by_the_problems() -> None:
     lines = to_markdown(played(matrix(name="a | b"), 1, breaks_with_markup).record).splitlines()
     assert lines[0] == "## a \\| b"
     assert lines[2] == "**8 runs; 1 with violations; 1 failed**"

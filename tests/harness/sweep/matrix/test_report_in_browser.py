@@ -41,7 +41,7 @@ def test_page_fits_the_screen_and_logs_no_error(
     assert browser.complaints == []
 
 
-def test_on_a_phone_heatmap_and_panels_are_whole(browser: Browser, page: Path) -> None:
+def test_heatmap_and_panels_fit_a_phone(browser: Browser, page: Path) -> None:
     browser.show(page, width=390, scheme="light")
     right = SHOWN.format(".tile, .one-by-one svg", "getBoundingClientRect().right")
     edges = browser.evaluate(right)
@@ -51,7 +51,7 @@ def test_on_a_phone_heatmap_and_panels_are_whole(browser: Browser, page: Path) -
     assert min(browser.evaluate(boxes)) > 300  # each shows a panel
 
 
-def test_a_click_on_a_cell_shows_its_runs_and_no_others(browser: Browser, page: Path) -> None:
+def test_click_on_a_cell_shows_only_its_runs(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(RUNS) == []
     browser.evaluate(f"{TILE}.scrollIntoView({{block: 'center'}})")
@@ -66,7 +66,7 @@ def test_a_click_on_a_cell_shows_its_runs_and_no_others(browser: Browser, page: 
     assert browser.complaints == []
 
 
-def test_the_keyboard_reaches_a_cell_its_runs_and_the_heatmap_again(browser: Browser, page: Path) -> None:
+def test_keyboard_reaches_a_cell_its_runs_and_the_heatmap_again(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     for _ in range(40):
         browser.press("Tab")
@@ -82,7 +82,7 @@ def test_the_keyboard_reaches_a_cell_its_runs_and_the_heatmap_again(browser: Bro
     assert browser.complaints == []
 
 
-def test_the_figure_chosen_by_key_is_that_of_heatmap_and_trend(browser: Browser, page: Path) -> None:
+def test_figure_chosen_by_key_is_shown_in_heatmap_and_trend(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     assert browser.evaluate(FIGURES) == ["one chain", "one chain"]
     browser.evaluate("document.getElementById('show-uniform').focus()")
@@ -91,7 +91,7 @@ def test_the_figure_chosen_by_key_is_that_of_heatmap_and_trend(browser: Browser,
     assert browser.complaints == []
 
 
-def test_paper_has_all_heatmaps_the_chosen_trend_and_the_chosen_runs(browser: Browser, page: Path) -> None:
+def test_printed_page_has_heatmaps_chosen_trend_and_chosen_runs(browser: Browser, page: Path) -> None:
     browser.show(page, width=1280, scheme="light")
     with browser.on_paper():
         figures = browser.evaluate(FIGURES)

@@ -34,7 +34,7 @@ def same(one: MatrixRecord, other: MatrixRecord) -> bool:
     return one.model_dump(exclude=machine) == other.model_dump(exclude=machine)
 
 
-def test_an_interrupted_matrix_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_interrupted_matrix_continues_where_it_stopped(tmp_path: Path) -> None:
     seen: Count = []
     broken_off = played(matrix(), 1, counting(seen, until=3), tmp_path).record
     assert (broken_off.outcome, broken_off.runs) == ("interrupted", 3)
@@ -46,14 +46,14 @@ def test_an_interrupted_matrix_goes_on_where_it_was(tmp_path: Path) -> None:
     assert whole.record.started_at == broken_off.started_at
 
 
-def test_a_finished_matrix_is_not_played_again(tmp_path: Path) -> None:
+def test_finished_matrix_is_not_played_again(tmp_path: Path) -> None:
     first, seen = played(matrix(), 2, judge, tmp_path), []
     again = played(matrix(), 2, counting(seen, until=0), tmp_path)
     assert again.runs == first.runs
     assert again.record.outcome == "completed"
 
 
-def test_a_crashed_run_is_a_result(tmp_path: Path) -> None:
+def test_crashed_run_is_a_result(tmp_path: Path) -> None:
     def crashes(scenario: Scenario, seed: int) -> Result:
         if seed == 2:
             raise RuntimeError("no more")
@@ -79,7 +79,7 @@ def test_directory_of_an_unplayable_matrix_remains_only_with_results(tmp_path: P
 
 
 @pytest.mark.parametrize("padding", [0, 5000])
-def test_half_a_last_line_is_played_again(tmp_path: Path, padding: int) -> None:
+def test_run_of_an_incomplete_last_line_is_played_again(tmp_path: Path, padding: int) -> None:
     whole = played(matrix(), 1, judge, tmp_path)
     path = tmp_path / FILE
     complete = path.read_bytes()
@@ -125,7 +125,7 @@ def test_file_of_another_program_is_not_changed(tmp_path: Path, content: str) ->
 
 
 @pytest.mark.parametrize("change", [{"seed": 99}, {"loss": 0.25}, {"figures": []}])
-def test_a_line_that_is_no_run_of_the_matrix_is_named(tmp_path: Path, change: dict[str, object]) -> None:
+def test_line_without_a_run_of_the_matrix_is_named(tmp_path: Path, change: dict[str, object]) -> None:
     played(matrix(), 1, judge, tmp_path)
     path = tmp_path / FILE
     lines = path.read_text().splitlines()
@@ -142,13 +142,13 @@ def test_second_command_on_the_same_matrix_is_refused(tmp_path: Path) -> None:
         played(matrix(), 1, judge, tmp_path)
 
 
-def test_a_directory_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+def test_unwritable_directory_causes_one_sentence(tmp_path: Path) -> None:
     (tmp_path / FILE).mkdir()
     with pytest.raises(RunDirectoryError, match=r"results\.jsonl cannot be written: Is a directory; choose another"):
         played(matrix(), 1, judge, tmp_path)
 
 
-def test_a_full_disk_is_one_sentence_with_the_way_on(tmp_path: Path) -> None:
+def test_full_disk_causes_one_sentence_with_a_solution(tmp_path: Path) -> None:
     (run,) = played(matrix(loss=(0.0,), seeds=1), 1, judge).runs
     with opened(tmp_path, matrix()) as results:
         results._file.close()

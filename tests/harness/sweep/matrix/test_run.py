@@ -53,7 +53,7 @@ def test_each_cell_sums_up_its_runs() -> None:
     assert record.exit_status == 1
 
 
-def test_the_result_does_not_depend_on_the_number_of_jobs() -> None:
+def test_result_does_not_depend_on_the_number_of_jobs() -> None:
     one, two = (played(matrix(seeds=[5, 3, 9]), jobs, judge) for jobs in (1, 2))
     assert one.runs == two.runs
     assert [(run.loss, run.seed) for run in one.runs] == [(0.0, 5), (0.0, 3), (0.0, 9), (0.5, 5), (0.5, 3), (0.5, 9)]
@@ -76,7 +76,7 @@ def test_failed_run_is_reported_and_the_others_count() -> None:
     assert "seed 3 failed: KeyError: 'block'" in shown(record)
 
 
-def test_a_scenario_that_cannot_be_played_is_one_error() -> None:
+def test_unplayable_scenario_causes_one_error() -> None:
     def refuses(scenario: Scenario, seed: int) -> Result:
         raise MachineError("not in the simulation")
 
@@ -84,7 +84,7 @@ def test_a_scenario_that_cannot_be_played_is_one_error() -> None:
         played(matrix(), 2, refuses)
 
 
-def test_an_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
+def test_interrupt_keeps_the_runs_that_had_ended(tmp_path: Path) -> None:
     calls = itertools.count()
 
     def interrupted(scenario: Scenario, seed: int) -> Result:
@@ -112,7 +112,7 @@ def test_interrupt_before_the_first_run_still_writes_all_files(tmp_path: Path) -
     assert shown(finished.record)
 
 
-def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> None:
+def test_files_read_back_equal_the_written_data(tmp_path: Path) -> None:
     finished = played(matrix(), 1, judge)
     matrix_outputs.write(finished, tmp_path)
     document = json.loads((tmp_path / "matrix.json").read_text())
@@ -131,7 +131,7 @@ def test_the_files_read_back_as_what_they_were_written_from(tmp_path: Path) -> N
     assert (runs[5]["bytes"], runs[5]["failed"]) == ("", ""), "unknown is empty"
 
 
-def test_the_table_fits_eighty_columns_and_names_what_was_violated() -> None:
+def test_table_fits_eighty_columns_and_names_violations() -> None:
     lines = shown(played(matrix(), 1, judge).record)
     assert "\u2026" not in lines
     assert "100 %" in lines
@@ -149,7 +149,7 @@ def test_single_run_has_no_interval_and_this_is_reported() -> None:
     assert "no intervals" in drawing
 
 
-def test_the_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> None:
+def test_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> None:
     drawing = ElementTree.fromstring(draw(played(matrix(), 1, judge).record))  # noqa: S314 - ours
     texts = {element.text for element in drawing.iter(f"{SVG}text")}
     assert {panel.title for panel in PANELS} <= texts
@@ -159,7 +159,7 @@ def test_the_picture_has_a_panel_for_each_figure_and_a_dot_for_each_mean() -> No
     assert "50\u00a0% loss: 12.5 (\u00b12.1)" in tips
 
 
-def test_the_picture_escapes_names_and_refers_to_nothing() -> None:
+def test_picture_escapes_names_and_refers_to_no_file() -> None:
     drawing = draw(played(matrix(name='<script>"&'), 1, judge).record)
     assert "<script" not in drawing
     ElementTree.fromstring(drawing)  # noqa: S314 - ours
@@ -173,7 +173,7 @@ def test_any_range_of_losses_can_be_drawn(loss: tuple[float, ...]) -> None:
     assert all(0 < place < 900 for place in places)
 
 
-def test_the_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
+def test_thesis_page_has_a_place_for_the_table_and_every_rate() -> None:
     record = played(matrix(loss=tuple(OBSERVED)), 1, judge).record
     page = put_between_markers(PAGE.read_text(), thesis_table(record))
     rows = page.split(BEGIN)[1].split(END)[0].splitlines()

@@ -69,7 +69,7 @@ def test_failed_task_gives_its_reason_and_others_continue(jobs: int) -> None:
     assert failed.reason.startswith("ZeroDivisionError: division by zero (test_sweep.py line ")
 
 
-def test_a_killed_process_costs_one_task() -> None:
+def test_killed_process_fails_one_task() -> None:
     def work(number: int) -> int:
         if number in (3, 4, 9):
             os.kill(os.getpid(), signal.SIGKILL)
@@ -109,7 +109,7 @@ def test_no_tasks_have_no_outcomes() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_ends_all_processes_at_once(number: signal.Signals) -> None:
+def test_interrupt_ends_all_processes_at_once(number: signal.Signals) -> None:
     with subprocess.Popen([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         pids = [int(process.stdout.readline()) for _ in range(2)]
@@ -119,7 +119,7 @@ def test_an_interrupt_ends_all_processes_at_once(number: signal.Signals) -> None
     assert not any(alive(pid) for pid in pids)
 
 
-def test_ctrl_c_in_a_terminal_is_for_the_one_that_started_them() -> None:
+def test_ctrl_c_in_a_terminal_signals_only_the_starting_process() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as process:
@@ -131,7 +131,7 @@ def test_ctrl_c_in_a_terminal_is_for_the_one_that_started_them() -> None:
     assert said == "interrupted\n"
 
 
-def test_the_processes_die_with_the_one_that_started_them() -> None:
+def test_processes_die_with_the_process_that_started_them() -> None:
     with subprocess.Popen([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         pids = [int(process.stdout.readline()) for _ in range(2)]
