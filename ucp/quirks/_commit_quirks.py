@@ -73,7 +73,7 @@ def forget_own_vote(good: Handler, core: Core) -> str:
 
 @quirk(2)
 def keep_old_votes(good: Handler, core: Core) -> str:
-    """A new vote starts with the votes counted in the previous vote."""
+    """A new vote starts with the counts of the previous vote."""
     before = core.vote_count
     branch = good(core)
     if branch == "proposed":
@@ -95,7 +95,7 @@ def approve_everything(good: Helper, core: Core, message: BlockAddResponse) -> N
 
 @quirk(3, helper=Core.send)
 def disapprove_everything(good: Helper, core: Core, message: BlockAddResponse) -> None:
-    """The agent disapproves every block."""
+    """The agent disapproves of every block."""
     good(core, replace(message, approve=False))
 
 
@@ -114,7 +114,7 @@ def count_votes_twice(good: Handler, core: Core, sender: int, message: BlockAddR
 
 @quirk(4)
 def count_votes_for_others(good: Handler, core: Core, sender: int, message: BlockAddResponse) -> str:
-    """Votes on blocks of other agents count for the agent's own candidate."""
+    """The agent counts votes on blocks of other agents as votes on its own block."""
     if core.candidate_block is not None:
         message = replace(message, block_hash=core.candidate_block.block_hash)
     return good(core, sender, message)
@@ -217,7 +217,7 @@ def ignore_commit(good: Handler, core: Core, sender: int, message: CommitBlock, 
 
 @quirk(6)
 def commit_without_succession(good: Handler, core: Core, sender: int, message: CommitBlock) -> str:
-    """The agent commits blocks of other agents without the succession test."""
+    """The agent commits blocks of other agents even if they do not follow its top block."""
     succeeding = next_chain_hash(core.chain.top_chain_hash, message.block.block_hash)
     return good(core, sender, replace(message, chain_hash=succeeding))
 

@@ -64,7 +64,7 @@ def answer_phase1_while_reconciling(good: Handler, core: Core, sender: int, mess
 
 @quirk(10)
 def count_phase1_of_others(good: Handler, core: Core, sender: int, message: ChainContainResponse) -> str:
-    """Phase 1 answers about other chains count for the agent's own chain."""
+    """The agent counts phase 1 answers about other chains as answers about its own chain."""
     return good(core, sender, replace(message, chain_hash=core.chain.top_chain_hash))
 
 
@@ -92,7 +92,7 @@ def never_pop(good: Handler, core: Core) -> str:
 
 @quirk(11, helper=Core.pop_to_stack)
 def pop_two_blocks(good: Helper, core: Core) -> None:
-    """Phase 1 pops two blocks at a time."""
+    """Phase 1 removes two blocks at a time from the chain."""
     good(core)
     if len(core.chain):
         good(core)
@@ -100,7 +100,7 @@ def pop_two_blocks(good: Helper, core: Core) -> None:
 
 @quirk(11, helper=Core.pop_to_stack)
 def lose_popped_block(good: Helper, core: Core) -> None:
-    """Phase 1 pops a block and does not push it onto the reconcile stack."""
+    """Phase 1 removes a block from the chain and does not put it onto the reconcile stack."""
     good(core)
     core.pop_from_stack()
 
@@ -154,7 +154,7 @@ def count_phase2_twice(good: Handler, core: Core, sender: int, message: NextInSe
 
 @quirk(14)
 def count_phase2_of_others(good: Handler, core: Core, sender: int, message: NextInSequenceResponse) -> str:
-    """Phase 2 answers about other chains count for the agent's own chain."""
+    """The agent counts phase 2 answers about other chains as answers about its own chain."""
     return good(core, sender, replace(message, chain_hash=core.chain.top_chain_hash))
 
 
@@ -168,7 +168,7 @@ def crash_on_tie(good: Handler, core: Core) -> str:
 
 @quirk(15)
 def youngest_on_tie(good: Handler, core: Core) -> str:
-    """A tie in phase 2 selects the youngest timestamp."""
+    """The agent selects the answer with the youngest timestamp in a tie of phase 2."""
     for counter_record in core.reconcile_response_dictionary.values():
         counter_record[1] = -counter_record[1]
     return good(core)
@@ -176,7 +176,7 @@ def youngest_on_tie(good: Handler, core: Core) -> str:
 
 @quirk(15)
 def choose_minority(good: Handler, core: Core) -> str:
-    """Phase 2 selects the answer with the fewest votes."""
+    """The agent selects the phase 2 answer that the fewest agents gave."""
     for counter_record in core.reconcile_response_dictionary.values():
         counter_record[0] = -counter_record[0]
     return good(core)
@@ -193,7 +193,7 @@ def early_phase3_expiry(good: Handler, core: Core) -> str:
 
 @quirk(16)
 def ask_for_what_is_held(good: Handler, core: Core) -> str:
-    """Phase 3 requests a block that is on the reconcile stack."""
+    """Phase 3 requests a block from other agents although it is on the reconcile stack."""
     if core.majority_response_block_hash not in [block.block_hash for block in core.reconcile_stack]:
         return good(core)
     core.start(core.phase_three_timer, core.settings.phase3_timeout_s)
@@ -226,7 +226,7 @@ def send_top_block(good: Helper, core: Core, message: BlockResponse) -> None:
 
 @quirk(17, helper=Core.send, sends=(CommitBlock,))
 def wrong_topic(good: Helper, core: Core, message: BlockResponse) -> None:
-    """A requested block is sent as a Commit Block, and triggers the wrong handler."""
+    """The agent sends a requested block as a Commit Block, and the receiver runs the wrong handler."""
     good(core, CommitBlock(message.block, core.chain.top_chain_hash))
 
 
@@ -267,19 +267,19 @@ def pause_without_resume(good: Handler, core: Core, sender: int, message: BlockR
 
 @quirk(18, helper=Core.trigger, triggers=("Reconcile Phase 1",))
 def wrong_event(good: Helper, core: Core, event: LocalEvent) -> None:
-    """A block that phase 3 commits triggers phase 1 instead of phase 2."""
+    """After phase 3 has committed a block, the agent continues with phase 1 instead of phase 2."""
     good(core, "Reconcile Phase 1")
 
 
 @quirk(19, helper=Core.trigger, triggers=("Reconcile Phase 2",))
 def never_give_up(good: Helper, core: Core, event: LocalEvent) -> None:
-    """If no block arrives, phase 3 returns to phase 2 instead of finalizing."""
+    """If no block arrives, the agent returns to phase 2 instead of continuing with Finalize."""
     good(core, "Reconcile Phase 2")
 
 
 @quirk(19, helper=Core.trigger)
 def give_up_unfinished(good: Helper, core: Core, event: LocalEvent) -> None:
-    """If no block arrives, the reconcile stops without finalizing."""
+    """If no block arrives, the agent stops the reconcile without the phase Finalize."""
 
 
 @quirk(20)
