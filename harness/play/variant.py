@@ -84,8 +84,9 @@ def of_core(
 ) -> Callable[[Callable[..., str]], CoreChange]:
     """Return a decorator that declares a function as the new handler of an algorithm in the agents.
 
-    The keyword arguments declare what the new handler does and the original handler does not: `branches` that it
-    returns, messages that it `sends`, timers that it `starts`, and local events that it `triggers`.
+    The keyword arguments declare the additional actions of the new handler, compared with the original handler: the
+    `branches` that it returns, the messages that it `sends`, the timers that it `starts`, and the local events that it
+    `triggers`.
     """
     return lambda run: CoreChange(algorithm, run, branches, sends, starts, triggers)
 
