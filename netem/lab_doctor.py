@@ -42,8 +42,8 @@ def examine() -> list[LabRequirement]:
         return requirements
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "lab.log")
-        tried = {name: _try(name, log) for name in ("netem", "nftables")}
-        chosen = _try(None, log)
+        tried = {name: _try_engine(name, log) for name in ("netem", "nftables")}
+        chosen = _try_engine(None, log)
         channel = [_shared_channel(log)] if isinstance(chosen, str) else []
     broken = next((e for e in tried.values() if isinstance(e, LabError) and getattr(e, "stage", "") != "engine"), None)
     if broken is not None:
@@ -84,7 +84,7 @@ def _shared_channel(log: Path) -> LabRequirement:
     return LabRequirement("shared channel", problem is None, detail, way_out, needed=False)
 
 
-def _try(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
+def _try_engine(engine: Literal["netem", "nftables"] | None, log: Path) -> str | LabError:
     """Return the engine that a test network uses, or the reason why the network could not be opened."""
 
     async def attempt() -> str:

@@ -154,7 +154,7 @@ second number, plus the third number multiplied by another random number.
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
 
 
-def _way(link: LinkConditions, latency: Delay) -> _Way:
+def _loss_and_delay(link: LinkConditions, latency: Delay) -> _Way:
     delay = link.delay or latency
     return round(link.independent_loss * _WORD), delay.mean_s - delay.jitter_s, 2 * delay.jitter_s / _WORD
 
@@ -170,7 +170,9 @@ class _PlainSenderLinks:
 
     def __init__(self, links: list[LinkConditions], hears: list[bool], words: _RandomWords, latency: Delay) -> None:
         self.receivers = len(links)
-        self.ways = [_way(link, latency) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)]
+        self.ways = [
+            _loss_and_delay(link, latency) if heard else _NO_WAY for link, heard in zip(links, hears, strict=True)
+        ]
         self.reached = [(receiver, *way) for receiver, way in enumerate(self.ways) if way != _NO_WAY]
         self.certain = all(lost_below in (0, _WORD) for _, lost_below, _, _ in self.reached)
         delays = [link.delay or latency for link in links]

@@ -113,7 +113,7 @@ class Autopilot:
             self._then()
         self.now_s = until_s
         while self.has_booted and (failsafe := self._failsafe()):
-            self._save(failsafe)
+            self._react_to_failsafe(failsafe)
         if self.failsafes.lacks_a_motor and self.armed and self.airborne:
             self._lose_thrust()
 
@@ -246,7 +246,7 @@ class Autopilot:
     def _failsafe(self) -> Failsafe | None:
         return self.failsafes.look(self.now_s, self.battery_used, self.motion.point, self.station_heard_s)
 
-    def _save(self, failsafe: Failsafe) -> None:
+    def _react_to_failsafe(self, failsafe: Failsafe) -> None:
         """React to a failsafe as ArduPilot does. For example, if the position is lost, a copter lands and a rover
         stops.
         """

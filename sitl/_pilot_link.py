@@ -226,7 +226,7 @@ class PilotLink(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
-        self._beat()
+        self._send_heartbeat()
 
     def data_received(self, data: bytes) -> None:
         self.heard_at = time.monotonic()
@@ -253,7 +253,7 @@ class PilotLink(asyncio.Protocol):
         self.closed.set()
         self.heard.set()
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         heartbeat = mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
         )
@@ -268,7 +268,7 @@ class PilotLink(asyncio.Protocol):
             except OSError as error:
                 self._give_up_log(error)
         interval_s = min(HEARTBEAT_INTERVAL_S, MAX_HEARTBEAT_INTERVAL_S / self.speedup)
-        self._timer = asyncio.get_running_loop().call_later(interval_s, self._beat)
+        self._timer = asyncio.get_running_loop().call_later(interval_s, self._send_heartbeat)
 
     def _log(self, now_us: int, frame: bytearray) -> None:
         if self._tlog is not None:

@@ -68,7 +68,7 @@ class PlaneMotion:
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and then circle without end."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
-        place = _ahead(start, AHEAD_M)._replace(up_m=altitude_m)
+        place = _point_ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
         circle = _PlanePath(end_of(path.segments), CRUISE_MS * OVER_GROUND, altitude_m, TAKE_OFF_CLIMB_MS)
         circle.arc(place[:2], math.inf)
@@ -114,7 +114,7 @@ class PlaneMotion:
         sink_ms = start.up_m / glide_s if glide_s else 0.0
         glide = _back_and_on(start, touchdown, before, LANDING_MS, sink_ms, 0.0)
         ground = replace(end_of(glide), up_m=0.0)
-        stand = _ahead(ground, ROLL_OUT_M + PAST_M)
+        stand = _point_ahead(ground, ROLL_OUT_M + PAST_M)
         return [*glide, StraightLine(ground, stand, LANDING_MS, ROLL_OUT_ACCEL_MS2, from_ms=LANDING_MS)]
 
 
@@ -150,7 +150,7 @@ class _PlanePath:
         self._end, self._up_m, self._rate_ms = start, up_m, rate_ms
 
     def straight(self, length_m: float) -> None:
-        self.straight_to(_ahead(self._end, length_m))
+        self.straight_to(_point_ahead(self._end, length_m))
 
     def straight_to(self, place: LocalPlace) -> None:
         end = place._replace(up_m=self._end.up_m)
@@ -194,7 +194,7 @@ def _lift_off(
     start: MotionState, altitude_m: float, straight_to_m: float
 ) -> tuple[Sequence[MotionSegment], _PlanePath]:
     """Return the segments on the ground before the take-off, and a path that climbs to `altitude_m`."""
-    run = StraightLine(start, _ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
+    run = StraightLine(start, _point_ahead(start, RUNWAY_M), CRUISE_MS, RUNWAY_ACCEL_MS2, to_ms=CRUISE_MS)
     path = _PlanePath(end_of([run]), TAKE_OFF_MS, altitude_m, TAKE_OFF_CLIMB_MS)
     path.straight(TAKE_OFF_MS * max(0.0, straight_to_m - start.up_m) / TAKE_OFF_CLIMB_MS)
     return [RestSegment(start, SPOOL_UP_S), run], path
@@ -210,7 +210,7 @@ def _back_and_on(
     line_rad = _bearing_rad(before, place)
     turn_rad = (line_rad - start.yaw_rad + math.pi) % math.tau - math.pi
     sways_m = math.copysign(SWAY_M, turn_rad) if abs(turn_rad) < math.pi / 2 else 0.0
-    swayed = _beside(MotionState(*aim, yaw_rad=line_rad), sways_m)
+    swayed = _point_beside(MotionState(*aim, yaw_rad=line_rad), sways_m)
     back = _fly_by(start, LocalPlace(*swayed, aim.up_m), max(speed_ms, CRUISE_MS * OVER_GROUND), rate_ms, REACHED_M)
     return [*back, *_fly_by(end_of(back), place, speed_ms, rate_ms, reached_m)]
 
@@ -239,7 +239,7 @@ def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather
     """
     ways = []
     for side in (1, -1):  # to the right, to the left
-        centre = _beside(start, side * radius_m)
+        centre = _point_beside(start, side * radius_m)
         north, east = place.north_m - centre[0], place.east_m - centre[1]
         away_m = math.hypot(north, east)
         if away_m < radius_m:
@@ -294,7 +294,7 @@ def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlac
     return LocalPlace(north_m, east_m, place.up_m)
 
 
-def _ahead(start: MotionState, length_m: float) -> LocalPlace:
+def _point_ahead(start: MotionState, length_m: float) -> LocalPlace:
     return LocalPlace(
         start.north_m + length_m * math.cos(start.yaw_rad),
         start.east_m + length_m * math.sin(start.yaw_rad),
@@ -302,6 +302,6 @@ def _ahead(start: MotionState, length_m: float) -> LocalPlace:
     )
 
 
-def _beside(start: MotionState, right_m: float) -> tuple[float, float]:
+def _point_beside(start: MotionState, right_m: float) -> tuple[float, float]:
     """Return the position (north, east) of the point at this distance to the right of the vehicle."""
     return start.north_m - right_m * math.sin(start.yaw_rad), start.east_m + right_m * math.cos(start.yaw_rad)

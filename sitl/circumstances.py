@@ -108,7 +108,7 @@ async def bring_about(link: PilotLink, circumstance: SimulatedFailure) -> Mappin
         return next((way for way in ways if link.parameters.keys() >= way.keys()), None)
 
     asked_at = time.monotonic()
-    chosen = await _heard(link, known, ask_for_all, limit_s)
+    chosen = await _await_answer(link, known, ask_for_all, limit_s)
     if link.closed.is_set():
         raise NotSimulatedError(f"ended its connection before it could simulate {circumstance.what}")
     if chosen is None and link.heard_at < asked_at:
@@ -126,13 +126,13 @@ async def bring_about(link: PilotLink, circumstance: SimulatedFailure) -> Mappin
     def came_about() -> Mapping[str, float] | None:
         return values if all(_same(link.parameters[name], value) for name, value in values.items()) else None
 
-    if await _heard(link, came_about, set_all, limit_s) is None:
+    if await _await_answer(link, came_about, set_all, limit_s) is None:
         said = ", ".join(f"{name} {link.parameters[name]:g}" for name in values)
         raise NotSimulatedError(f"did not simulate {circumstance.what}: after {limit_s:g} s it reports {said}")
     return values
 
 
-async def _heard(
+async def _await_answer(
     link: PilotLink,
     answer: Callable[[], Mapping[str, float] | None],
     ask: Callable[[], None],

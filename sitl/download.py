@@ -140,7 +140,7 @@ def _chunks(url: str, answer: Any, stall_s: float) -> Iterator[bytes]:
     """Yield the content in pieces. Raises DownloadError if the content is missing or incomplete."""
     left: int | None = answer.length
     if left is None and not answer.chunked:
-        raise _endless(url)
+        raise _unknown_size_error(url)
     while left != 0:
         try:
             chunk = answer.read1(CHUNK if left is None else min(CHUNK, left))
@@ -162,7 +162,7 @@ def _broken_off(url: str) -> DownloadError:
     return DownloadError(f"{url} ended too early: run the same command again to continue")
 
 
-def _endless(url: str) -> DownloadError:
+def _unknown_size_error(url: str) -> DownloadError:
     """Return the error for an answer that does not state the size of the file. The harness needs the size to check that
     the downloaded file is complete.
     """
@@ -201,7 +201,7 @@ def _size(url: str, answer: Any, limit: int) -> int:
     """
     size: int | None = answer.length
     if size is None:
-        raise _endless(url)
+        raise _unknown_size_error(url)
     if size > limit:
         raise DownloadError(f"{url} has {megabytes(size)}, more than {megabytes(limit)}: use another --url")
     return size

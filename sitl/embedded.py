@@ -128,11 +128,11 @@ def main(argv: Sequence[str] | None = None) -> NoReturn:
             ports.append(VehiclePort(number, autopilot, selector))
         except (OSError, OverflowError) as error:
             reason = error.strerror if isinstance(error, OSError) else "a port is 0 to 65535"
-            sys.exit(_complain(arguments.sysid, number, str(reason)))
+            sys.exit(_report_unavailable_port(arguments.sysid, number, str(reason)))
     _fly(autopilot, ports, selector, arguments.speedup)
 
 
-def _complain(sysid: int, port: int, reason: str) -> int:
+def _report_unavailable_port(sysid: int, port: int, reason: str) -> int:
     message = (
         f"vehicle {sysid}: cannot listen on 127.0.0.1:{port}: {reason}; end the process that listens there, or choose "
         "another port\n"

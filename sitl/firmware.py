@@ -146,11 +146,11 @@ def install(
     with _ways_out(home), _locked(home, watcher):
         number = version.removeprefix("stable-")
         if _NUMBER.fullmatch(number) and _intact(vehicle, home / number):
-            return _use(InstalledVersion(vehicle, home / number), already=True)
+            return _select(InstalledVersion(vehicle, home / number), already=True)
         build = server.build()
         place = home / build.name
         if _intact(vehicle, place):
-            return _use(InstalledVersion(vehicle, place), already=True)
+            return _select(InstalledVersion(vehicle, place), already=True)
         part = home / f".{build.name}.part"
         part.mkdir(exist_ok=True)
         binary = server.fetch_binary(part, watcher)
@@ -159,7 +159,7 @@ def install(
         DownloadManifest(vehicle, build.version, build.commit, fetched_at, files).write(part)
         shutil.rmtree(place, ignore_errors=True)  # damaged
         part.rename(place)
-        return _use(InstalledVersion(vehicle, place), already=False)
+        return _select(InstalledVersion(vehicle, place), already=False)
 
 
 class _ReleaseServer:
@@ -288,7 +288,7 @@ def _intact(vehicle: VehicleType, directory: Path) -> bool:
     return directory.is_dir() and InstalledVersion(vehicle, directory).damage is None
 
 
-def _use(installed: InstalledVersion, already: bool) -> InstallOutcome:
+def _select(installed: InstalledVersion, already: bool) -> InstallOutcome:
     """Select this version for runs, and remove unfinished installations."""
     home = installed.directory.parent
     link = home / f".{CURRENT}"

@@ -125,7 +125,7 @@ class ClientChannel:
             case mavlink.MAV_CMD_DO_FLIGHTTERMINATION if message.param1 > 0.5:
                 return vehicle.disarm(force=True)
             case mavlink.MAV_CMD_NAV_TAKEOFF:
-                return vehicle.take_off(_seventh(message))
+                return vehicle.take_off(_parameter_7(message))
             case mavlink.MAV_CMD_NAV_LAND:
                 return self._set_mode("LAND")
             case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
@@ -262,6 +262,6 @@ class ClientChannel:
         )
 
 
-def _seventh(message: Any) -> float:
+def _parameter_7(message: Any) -> float:
     """Return parameter 7 of a command, the altitude. In a COMMAND_INT it has the name z."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -51,30 +51,30 @@ class ShownVehicle(Autopilot):
     def motion(self) -> MotionState:
         return self._track.course.at(self.now_s - READY_S)
 
-    def _no(self) -> int:
+    def _deny(self) -> int:
         self.say(mavlink.MAV_SEVERITY_WARNING, REFUSAL)
         return int(mavlink.MAV_RESULT_DENIED)
 
     def arm(self) -> int:
-        return self._no()
+        return self._deny()
 
     def disarm(self, force: bool = False) -> int:
-        return self._no()
+        return self._deny()
 
     def take_off(self, altitude_m: float) -> int:
-        return self._no()
+        return self._deny()
 
     def set_mode(self, number: float) -> int:
-        return self._no()
+        return self._deny()
 
     def start_mission(self) -> int:
-        return self._no()
+        return self._deny()
 
     def set_speed(self, speed_ms: float) -> int:
-        return self._no()
+        return self._deny()
 
     def go_to(self, place: LocalPlace) -> int:
-        return self._no()
+        return self._deny()
 
     def load(self, mission: Sequence[Any]) -> None:
         raise AssertionError("it takes no missions")

@@ -143,7 +143,7 @@ def in_words(survived: Survival) -> list[str]:
     if len(survived.losses) > MAX_SENTENCES:
         sentences.append(f"{len(survived.losses) - MAX_SENTENCES} more losses of vehicles are in run.json")
     if survived.losses and survived.gone is not None and survived.completed is not None:
-        sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is(survived.gone)} gone")
+        sentences.append(f"at the end {_of(survived.gone, survived.completed)} {_is_or_are(survived.gone)} gone")
     elif survived.losses:
         sentences.append("at the end the number of lost completed blocks is unknown")
     if survived.before_final_reconcile is not None:
@@ -181,5 +181,5 @@ def _of(blocks: int, completed: int) -> str:
     return f"{blocks or 'none'} of {completed} completed blocks"
 
 
-def _is(count: int) -> str:
+def _is_or_are(count: int) -> str:
     return "are" if count > 1 else "is"

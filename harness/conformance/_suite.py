@@ -237,11 +237,11 @@ class VectorSuite:
             if not agent.reference_follows:  # the machine is late, so fewer agents should run in parallel
                 self._max_workers = max(MIN_WORKERS, self._max_workers - 1)
             if suspicion is not None:
-                self._suspect(variant_result, vector_map, suspicion)
+                self._add_suspicion(variant_result, vector_map, suspicion)
         finally:
             await agent.close()
 
-    def _suspect(self, variant_result: VariantResult, vector_map: VectorMap, suspicion: SuspectedFailure) -> None:
+    def _add_suspicion(self, variant_result: VariantResult, vector_map: VectorMap, suspicion: SuspectedFailure) -> None:
         variant_result.suspicions.append(suspicion)
         vector_map.avoid(suspicion.observation.key)
         kind = handlers_and_messages(suspicion.observation.outcome)

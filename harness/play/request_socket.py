@@ -126,7 +126,7 @@ async def _execute(interventions: Interventions, line: bytes) -> dict[str, Any]:
     return {"at_s": await asyncio.wrap_future(ask(interventions, request))}
 
 
-def _happen(interventions: Interventions, request: Mapping[str, Any]) -> Future[float]:
+def _request_event(interventions: Interventions, request: Mapping[str, Any]) -> Future[float]:
     entry = request.get("entry")
     if not isinstance(entry, dict):
         raise ScenarioError('`entry` must have keys of an entry of a timeline, such as {"heal": true}')
@@ -153,7 +153,7 @@ def _number(request: Mapping[str, Any], key: str) -> float:
 
 
 _COMMANDS: dict[str, Callable[[Interventions, Mapping[str, Any]], Future[float]]] = {
-    "happen": _happen,
+    "happen": _request_event,
     "pause": lambda interventions, _: interventions.pause(),
     "go_on": lambda interventions, _: interventions.resume(),
     "step": _step,

@@ -261,14 +261,16 @@ def prove(
         bounds = replace(bounds, reduced=False)
     try:
         if bounds.network == "any":
-            return _alone(bounds, limits, out, watch)
-        return _together(bounds, limits, out, watch)
+            return _prove_single_agents(bounds, limits, out, watch)
+        return _prove_swarm(bounds, limits, out, watch)
     except (ReductionError, UncoveredError) as error:
         raise HarnessError(f"{error}") from None
 
 
-def _alone(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]) -> Proof:
-    name, path = _claimed(bounds, out)
+def _prove_single_agents(
+    bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]
+) -> Proof:
+    name, path = _name_and_path(bounds, out)
     began_s = time.process_time()
     found = collect(bounds, most_bytes=limits.most_bytes, most_s=limits.most_s, watch=watch)
     figures = ExplorationFigures(
@@ -302,14 +304,16 @@ def _with_instants(bounds: Bounds) -> Bounds:
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
 
-def _claimed(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
+def _name_and_path(bounds: Bounds, out: Path | None) -> tuple[str, Path]:
     """Return the name and the file path of the scenario that the proof writes."""
     name = f"proof {bounds.agents} agents {bounds.blocks} blocks"
     return name, choose_path(out or default_path(name).with_suffix(".yaml"), name)
 
 
-def _together(bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]) -> Proof:
-    name, path = _claimed(bounds, out)
+def _prove_swarm(
+    bounds: Bounds, limits: Limits, out: Path | None, watch: Callable[[ExplorationProgress], None]
+) -> Proof:
+    name, path = _name_and_path(bounds, out)
     began_s = time.process_time()
     swarm = ModelSwarm(bounds)
     with Workers(swarm, limits.cores) as workers:

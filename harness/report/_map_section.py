@@ -64,12 +64,12 @@ def section(
     """Return the map section. Return None if no vehicle moved and no file is damaged. `types` maps vehicles to their
     types, if the types are known.
     """
-    if not any(_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
+    if not any(_has_moved(tracks, vehicle) for vehicle in tracks.by_vehicle):
         return MapSection(None, [], [], tracks.problems) if tracks.problems else None
     return _drawn(tracks, network, ink, types)
 
 
-def _moved(tracks: VehicleTracks, vehicle: int) -> bool:
+def _has_moved(tracks: VehicleTracks, vehicle: int) -> bool:
     fixes = tracks.by_vehicle[vehicle]
     return any(
         max(metres) - min(metres) > MOVES_M

@@ -33,7 +33,7 @@ def to_markdown(left: ReportSource) -> str:
         lines += [" \u00b7 ".join(f"{_short(label)} **{_short(figure)}**" for label, figure in figures), ""]
     if survived := _fault_sections.survival_section(record.survival, left.ink):
         lines += _listed(survived.sentences)
-    lines += _happened(_network_section.event_rows(record))
+    lines += _fault_table(_network_section.event_rows(record))
     lines += _listed(_network_section.channel(record))
     lines += _listed(_fault_sections.remote_sentences(record))
     lines += _listed([station] if (station := _network_section.ground_station(record)) else [])
@@ -60,7 +60,7 @@ def _evidence(judged: Sequence[VerdictEntry]) -> list[str]:
     )
 
 
-def _happened(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
+def _fault_table(happened: Sequence[tuple[str, str, str]]) -> Iterator[str]:
     if not happened:
         return
     yield row(["mission time", "fault", ""])

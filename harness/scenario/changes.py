@@ -50,7 +50,7 @@ class NetworkChange:
             "fully_connected": self.conditions.fully_connected and self.channel is None,
             **({"losses": dict(self.losses)} if self.losses else {}),
             **({} if self.what in (RANGE, FINAL_RECONCILE) else planned_key(self.at_s, at_s)),
-            **_hand(self.by_hand),
+            **_by_hand_entry(self.by_hand),
         }
 
 
@@ -73,10 +73,10 @@ class TimedInjection:
     def to_json(self, at_s: float) -> dict[str, object]:
         """Return the record of this injection. It started at mission second `at_s`."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
-        return {**record, **planned_key(self.at_s, at_s), **_hand(self.by_hand)}
+        return {**record, **planned_key(self.at_s, at_s), **_by_hand_entry(self.by_hand)}
 
 
-def _hand(by_hand: bool) -> dict[str, object]:
+def _by_hand_entry(by_hand: bool) -> dict[str, object]:
     return {"by_hand": True} if by_hand else {}
 
 

@@ -102,7 +102,7 @@ class NumberRange(StrictModel):
         return " and ".join([*words, *([f"at most {self.max:g}"] if self.max is not None else [])])
 
 
-def _exactly(value: Any) -> Any:
+def _exact_range(value: Any) -> Any:
     """Return a range that contains only this number. A value that is already a range is returned unchanged."""
     if isinstance(value, Mapping | NumberRange):
         return value
@@ -111,7 +111,7 @@ def _exactly(value: Any) -> Any:
     return {"min": value, "max": value}
 
 
-Count = Annotated[NumberRange, BeforeValidator(_exactly)]
+Count = Annotated[NumberRange, BeforeValidator(_exact_range)]
 
 
 class CommonBlocks(StrictModel):

@@ -105,9 +105,9 @@ class RadioLinks:
     def __init__(self, count: int, radio: Radio, energy_dbm: float, draws: Random) -> None:
         self._count = count
         self._radio = radio
-        self._power = _centibels(radio.power_dbm)
-        self._sensitivity = _centibels(radio.sensitivity_dbm)
-        self._energy = _centibels(energy_dbm)
+        self._power = _hundredths_of_db(radio.power_dbm)
+        self._sensitivity = _hundredths_of_db(radio.sensitivity_dbm)
+        self._energy = _hundredths_of_db(energy_dbm)
         self._each_frame = radio.shadowing_db > 0 and 0.0 in (radio.shadowing_m, radio.shadowing_s)
         self._correlated = radio.shadowing_db > 0 and not self._each_frame
         self._draws = draws
@@ -203,9 +203,9 @@ class RadioLinks:
         if radio.ground == "two_ray":
             heights = [max(place.up_m, 0.0) + radio.antenna_m for place in (one, other)]
             if min(heights) <= 0:
-                return _centibels(1000.0)
+                return _hundredths_of_db(1000.0)
             loss_db = max(loss_db, 40 * math.log10(metres) - 20 * math.log10(heights[0] * heights[1]))
-        return _centibels(loss_db)
+        return _hundredths_of_db(loss_db)
 
     def _age(self, now_ns: int) -> None:
         """Replace the shadowing values. How much of the old values remains depends on the time and the movement since
@@ -246,5 +246,5 @@ class RadioLinks:
         return [deviations[word % _TABLE_SIZE] for word in words]
 
 
-def _centibels(decibels: float) -> int:
+def _hundredths_of_db(decibels: float) -> int:
     return round(100 * decibels)

@@ -99,11 +99,11 @@ def _compare(evidence: Evidence) -> Judgement:
         agent_id: f"the trace is incomplete: {why}" for agent_id, why in evidence.cached(cross_examine).short.items()
     }
     if unjudged or not evidence.traces:
-        return Judgement(NAME, "not applicable", _why(unjudged))
+        return Judgement(NAME, "not applicable", _reason_not_judged(unjudged))
     return Judgement(NAME, "as specified", f"{steps} handler runs, each following Algorithms 1 to 20{timers.remark}")
 
 
-def _why(unjudged: dict[int, str]) -> str:
+def _reason_not_judged(unjudged: dict[int, str]) -> str:
     if not unjudged:
         return "the run has no traces, and exports do not show steps"
     by_reason: dict[str, list[int]] = {}

@@ -47,7 +47,7 @@ class StepDeviation:
         if self.run is None or self.expected is None:
             return self.what
         did, should = zip(*differences(self.run, self.expected, name), strict=True)
-        return f"it {_and(did)}; it should have {_and(should)}"
+        return f"it {_join(did)}; it should have {_join(should)}"
 
 
 def differences(run: HandlerRun, expected: HandlerRun, name: NameOf) -> Iterator[tuple[str, str]]:
@@ -81,13 +81,13 @@ def _changes(changes: Sequence[tuple[str, str]], name: NameOf) -> str:
     if not changes:
         return "changed nothing"
     words = [f"{operation} {name(block)}" for operation, block in changes[:SHOWN]]
-    return f"changed {', '.join(words)}{_more(changes)}"
+    return f"changed {', '.join(words)}{_and_more(changes)}"
 
 
 def _sent(sent: Sequence[SentMessage], others: Sequence[SentMessage], name: NameOf) -> str:
     if not sent:
         return "sent nothing"
-    return f"sent {', '.join(_message(message, others, name) for message in sent[:SHOWN])}{_more(sent)}"
+    return f"sent {', '.join(_message(message, others, name) for message in sent[:SHOWN])}{_and_more(sent)}"
 
 
 def _message(message: SentMessage, others: Sequence[SentMessage], name: NameOf) -> str:
@@ -135,7 +135,7 @@ def _tally(tally: Tally, name: NameOf) -> str:
             words.append(f"{key} {count}")
         else:
             words.append(f"{name(key) if key else 'Is Top Of Chain'}: {count}")
-    return ", ".join(words) + _more(list(tally))
+    return ", ".join(words) + _and_more(list(tally))
 
 
 def _was(is_so: bool, what: str) -> str:
@@ -146,9 +146,9 @@ def _been(is_so: bool, what: str) -> str:
     return f"been {what}" if is_so else f"been not {what}"
 
 
-def _more(things: Sequence[object]) -> str:
+def _and_more(things: Sequence[object]) -> str:
     return f" and {len(things) - SHOWN} more" if len(things) > SHOWN else ""
 
 
-def _and(phrases: Sequence[str]) -> str:
+def _join(phrases: Sequence[str]) -> str:
     return phrases[0] if len(phrases) == 1 else f"{', '.join(phrases[:-1])} and {phrases[-1]}"

@@ -101,7 +101,7 @@ def bisect(
     )
     step = history.begin(good_commit, bad_commit)
     while not isinstance(step, SuspectCommits):
-        tried = _try(workshop, history, step, good_outcome, runs)
+        tried = _try_commit(workshop, history, step, good_outcome, runs)
         result.tried.append(tried)
         report_progress(f"{tried.commit[:12]} {tried.verdict}: {tried.why}")
         step = history.mark(tried.verdict)
@@ -122,7 +122,7 @@ def _play_required(workshop: SubjectPlayer, history: GitBisection, commit: str, 
         ) from None
 
 
-def _try(
+def _try_commit(
     workshop: SubjectPlayer, history: GitBisection, commit: str, good: Outcome, runs: dict[str, tuple[Outcome, Path]]
 ) -> CommitTrial:
     try:

@@ -121,19 +121,19 @@ class CalibrationResult:
                 )
             return
         model, intervals = self.fit.model, self.fit.intervals
-        yield f"half of the messages arrive at {model.range_m:.0f} m ({_between(intervals['range_m'], '.0f')} m)"
-        yield f"the spread is {model.spread:.3f} ({_between(intervals['spread'], '.3f')}), in ln(distance)"
+        yield f"half of the messages arrive at {model.range_m:.0f} m ({_interval(intervals['range_m'], '.0f')} m)"
+        yield f"the spread is {model.spread:.3f} ({_interval(intervals['spread'], '.3f')}), in ln(distance)"
         if self.signal:
             yield (
-                f"the exponent is {self.signal.exponent:.2f} ({_between(self.signal.interval, '.2f')}), from "
+                f"the exponent is {self.signal.exponent:.2f} ({_interval(self.signal.interval, '.2f')}), from "
                 f"{self.signal.samples} signal strengths"
             )
         else:
             yield f"the exponent is assumed to be {self.exponent:g}, because delivery alone does not determine it"
         yield f"the shadowing is {self.exponent * model.spread * 10 / math.log(10):.2f} dB at this exponent"
-        yield f"{model.floor:.1%} of the messages are lost at any distance ({_between(intervals['floor'], '.1%')})"
+        yield f"{model.floor:.1%} of the messages are lost at any distance ({_interval(intervals['floor'], '.1%')})"
         if "load" in intervals:
-            range_of_load = _between(intervals["load"], ".1%")
+            range_of_load = _interval(intervals["load"], ".1%")
             yield f"each message of another vehicle within 5 ms costs {model.load:.1%} more ({range_of_load})"
         if self.validation:
             yield self.validation.sentence
@@ -223,7 +223,7 @@ def _share_json(share: DeliveryShare) -> dict[str, object]:
     }
 
 
-def _between(interval: ConfidenceInterval, form: str) -> str:
+def _interval(interval: ConfidenceInterval, form: str) -> str:
     return f"95 %: {interval.low:{form}} to {interval.high:{form}}"
 
 

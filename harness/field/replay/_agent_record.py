@@ -255,9 +255,9 @@ class RecordedTrace:
             return None
         others = [other.runs[-1].t for agent, other in flight.traces.items() if agent != self.agent_id and other.runs]
         others_until_s = max(others, default=0.0) - self.header.late_s
-        return unfinished(follower, trace, others_until_s, self._coming() if flight.exports else None)
+        return unfinished(follower, trace, others_until_s, self._arrivals() if flight.exports else None)
 
-    def _coming(self) -> Iterator[MessageArrival]:
+    def _arrivals(self) -> Iterator[MessageArrival]:
         """Yield the messages that reached the vehicle of the agent. Without a capture, yield the messages that other
         agents sent to the agent.
         """

@@ -188,13 +188,13 @@ def _hull(points: list[Point], side: int) -> list[Point]:
     for t, u in sorted(points, key=lambda point: (point[0], side * point[1])):
         if hull and hull[-1][0] == t:
             continue
-        while len(hull) > 1 and side * _turn(hull[-2], hull[-1], (t, u)) <= 0:
+        while len(hull) > 1 and side * _cross_product(hull[-2], hull[-1], (t, u)) <= 0:
             hull.pop()
         hull.append((t, u))
     return hull
 
 
-def _turn(a: Point, b: Point, c: Point) -> float:
+def _cross_product(a: Point, b: Point, c: Point) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 

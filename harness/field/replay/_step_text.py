@@ -87,7 +87,7 @@ class StepText:
         yield _row("branch", run.branch[:80])
         if run.changes:
             changes = (f"{operation} {self._names.of(block)}" for operation, block in run.changes)
-            yield _row("changed", _some(changes, len(run.changes)))
+            yield _row("changed", _first_words(changes, len(run.changes)))
         for sent in run.sent[:BLOCKS_SHOWN]:
             yield _row("sent", self.sent(sent))
         if run.started:
@@ -107,12 +107,12 @@ class StepText:
         if deviation.run is None or deviation.expected is None:
             return self.deviation(deviation)
         table = Table("", "the agent's record", "the reference", box=None, padding=(0, 2, 0, 0))
-        for label, own, right in self._sides(deviation.run, deviation.expected):
+        for label, own, right in self._compared_parts(deviation.run, deviation.expected):
             style = "" if own == right else "red"
             table.add_row(label, shown(own, style), shown(right, style))
         return table
 
-    def _sides(self, *runs: HandlerRun) -> Iterator[tuple[str, str, str]]:
+    def _compared_parts(self, *runs: HandlerRun) -> Iterator[tuple[str, str, str]]:
         own, right = runs
         yield "branch", own.branch, right.branch
         changes = ([f"{operation} {self._names.of(block)}" for operation, block in run.changes] for run in runs)
@@ -263,7 +263,7 @@ def _paired(label: str, own: list[str], right: list[str]) -> Iterator[tuple[str,
         yield label if not number else "", of_own, of_right
 
 
-def _some(text: Iterable[str], count: int) -> str:
+def _first_words(text: Iterable[str], count: int) -> str:
     shown = [word for word, _ in zip(text, range(BLOCKS_SHOWN), strict=False)]
     more = f" and {count - len(shown)} more" if count > len(shown) else ""
     return ", ".join(shown) + more

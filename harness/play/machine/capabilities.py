@@ -155,13 +155,13 @@ def _table(measured: EngineMeasurement) -> Table:
         mark = Text("✔", style="green") if row.ok else Text("✘", style="bold red")
         factor, unit = _SHOWN[row.question.unit]
         asked = f"{row.question.asked * factor:.4g} {unit}"
-        table.add_row(mark, row.question.condition, row.question.quantity, asked, *_found(row.answer, factor))
+        table.add_row(mark, row.question.condition, row.question.quantity, asked, *_result_texts(row.answer, factor))
         if row.before:
-            table.add_row("", "", "at first", "", *_found(row.before, factor), style="dim")
+            table.add_row("", "", "at first", "", *_result_texts(row.before, factor), style="dim")
     return table
 
 
-def _found(answer: Estimate, factor: float) -> tuple[str, str, str]:
+def _result_texts(answer: Estimate, factor: float) -> tuple[str, str, str]:
     interval = f"{answer.low * factor:.4g} to {answer.high * factor:.4g}"
     return f"{answer.measured * factor:.4g}", interval, str(answer.packets)
 

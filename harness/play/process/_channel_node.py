@@ -103,7 +103,7 @@ class ChannelNode:
         self._control.close()
         self._loop.close()
 
-    def _turn(self) -> None:
+    def _process_broadcasts(self) -> None:
         """Read the waiting broadcasts and deliver the frames that are due. Then set a timer for the next event."""
         channel, relay, clock = self._channel, self._relay, self._clock
         if channel is None or relay is None:
@@ -126,7 +126,7 @@ class ChannelNode:
             self._timer.cancel()
             self._timer = None
         if (next_s := channel.next_s) != NEVER:
-            self._timer = self._loop.call_later(clock.wall_s(next_s - clock.now()), self._turn)
+            self._timer = self._loop.call_later(clock.wall_s(next_s - clock.now()), self._process_broadcasts)
 
     def _take(self, channel: LiveChannel, heard: ReceivedBroadcast, at_s: float) -> None:
         data = heard.udp_data(self._port)
@@ -159,7 +159,7 @@ class ChannelNode:
             self._relay.open()
         except (OSError, NetemError) as error:
             raise CommandError(f"the kernel does not pass broadcasts to the shared channel: {error}") from None
-        self._loop.watch(self._relay.input, readable=self._turn)
+        self._loop.watch(self._relay.input, readable=self._process_broadcasts)
         return {}
 
     def _move(self, request: dict[str, Any]) -> dict[str, object]:
@@ -167,14 +167,14 @@ class ChannelNode:
         places = [Place(*triple) for triple in zip(coordinates, coordinates, coordinates, strict=True)]
         if self._relay is not None:
             self._started().move(places, self._clock.now())
-            self._turn()
+            self._process_broadcasts()
         return {}
 
     def _apply(self, request: dict[str, Any]) -> dict[str, object]:
         conditions = NetworkConditions.from_json(json.loads((self._directory / VALUE).read_text(encoding="utf-8")))
         if self._relay is not None:
             self._started().apply(conditions, self._clock.now())
-            self._turn()
+            self._process_broadcasts()
         return {}
 
     def _clear(self, request: dict[str, Any]) -> dict[str, object]:

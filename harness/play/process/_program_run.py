@@ -279,14 +279,14 @@ class ProgramRun:
         """Apply the fault to all its agents at the same time. If the fault is impossible for some of them, record the
         reasons. Raises ScenarioError if the fault is impossible for all of them.
         """
-        strikes = [self._strike(fault, agent_id) for agent_id in fault.agents]
+        strikes = [self._apply_fault(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
         for problem in problems:
             if not isinstance(problem, ScenarioError) or len(problems) == len(strikes):
                 raise problem
         self.played.unmatched_fates += map(str, problems)
 
-    async def _strike(self, fault: Fault, agent_id: int) -> None:
+    async def _apply_fault(self, fault: Fault, agent_id: int) -> None:
         if agent_id in self._starting:
             await self._starting.pop(agent_id)
         await fault.apply(self, agent_id)
@@ -447,7 +447,7 @@ class ProgramRun:
         return False
 
     async def keep_chains(self) -> None:
-        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        await asyncio.gather(*(agent.export() for agent in self._reachable_agents()))
         self.rundir.keep_exports_before_final_reconcile()
 
     async def reconcile(self, agent_id: int) -> None:
@@ -460,7 +460,7 @@ class ProgramRun:
         return {agent_id: status.completed for agent_id, status in (await self._statuses()).items()}
 
     async def snapshot(self) -> RunOutcome:
-        await asyncio.gather(*(agent.export() for agent in self._awake()))
+        await asyncio.gather(*(agent.export() for agent in self._reachable_agents()))
         for agent in self.agents:
             agent.collect_files()
         agents, remote = self._agent_records(), self._remote.records()
@@ -468,7 +468,7 @@ class ProgramRun:
         mission_s = round(self.clock.now(), 1)
         return replace(self.played, mission_s=mission_s, agents=agents, channel=channel, remote=remote)
 
-    def _awake(self) -> list[AgentProcess]:
+    def _reachable_agents(self) -> list[AgentProcess]:
         """Return the agents that are reachable: not dead, not paused, and not cut off from their computer."""
         return [agent for agent in self.agents if agent.awake and agent.agent_id not in self._remote.cut_off]
 

@@ -198,7 +198,7 @@ class FarEnds:
             hello = await receive_hello(connection, secret)
             if refused := self.refusal(hello, host):
                 await hello.answer({"refused": refused})
-                self._complain(f"{host} was refused: {refused}")
+                self._warn(f"{host} was refused: {refused}")
                 connection.close()
                 return
             channel = await hello.answer({"run": self._run, "name": self._name, "places": self._places})
@@ -206,7 +206,7 @@ class FarEnds:
             command = [str(word)[:MAX_TEXT] for word in words["command"]]
             await self._host.receive(FarEnd(words["agent"], words["session"], command, host, connection, channel))
         except (HandshakeError, WireError) as error:
-            self._complain(f"{host} {error}")
+            self._warn(f"{host} {error}")
             connection.close()
         except (OSError, TimeoutError):
             connection.close()
@@ -232,7 +232,7 @@ class FarEnds:
             )
         return self._host.refusal(agent_id, session, host)
 
-    def _complain(self, sentence: str) -> None:
+    def _warn(self, sentence: str) -> None:
         self._complaints += 1
         if self._complaints <= MAX_COMPLAINTS:
             sys.stderr.write(f"ucp-harness: {sentence}\n")

@@ -82,7 +82,7 @@ async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
     async with asyncio.timeout(HANDSHAKE_LIMIT_S):
         await loop.sock_sendall(connection, _CHALLENGE + own)
         hello = await _text(connection)
-        rest = await _exactly(connection, _NONCE_BYTES + _TAG_BYTES)
+        rest = await _receive_exactly(connection, _NONCE_BYTES + _TAG_BYTES)
         nonces = own + rest[:_NONCE_BYTES]
         if not hmac.compare_digest(rest[_NONCE_BYTES:], _mac(secret, b"UCP hello", nonces, hello)):
             data = json.dumps({"refused": "the secret is wrong"}).encode()
@@ -98,7 +98,7 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(HANDSHAKE_LIMIT_S):
-        challenge = await _exactly(connection, len(_CHALLENGE) + _NONCE_BYTES)
+        challenge = await _receive_exactly(connection, len(_CHALLENGE) + _NONCE_BYTES)
         if not challenge.startswith(_CHALLENGE):
             raise HandshakeError("is not a harness of this version")
         own, exchange = secrets.token_bytes(_NONCE_BYTES), KeyExchange()
@@ -107,7 +107,7 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
         tag = _mac(secret, b"UCP hello", nonces, words)
         await loop.sock_sendall(connection, _LENGTH.pack(len(words)) + words + own + tag)
         data = await _text(connection)
-        answered = await _exactly(connection, _TAG_BYTES)
+        answered = await _receive_exactly(connection, _TAG_BYTES)
     if not hmac.compare_digest(answered, _mac(secret, b"UCP welcome", nonces, words, data)):
         raise HandshakeError("has another secret: copy the secret file of the harness to this computer")
     welcome = _parsed(data)
@@ -150,13 +150,13 @@ def _parsed(data: bytes) -> dict[str, Any]:
 
 
 async def _text(connection: socket.socket) -> bytes:
-    (length,) = _LENGTH.unpack(await _exactly(connection, _LENGTH.size))
+    (length,) = _LENGTH.unpack(await _receive_exactly(connection, _LENGTH.size))
     if length > MAX_TEXT_BYTES:
         raise HandshakeError(f"sent {length} bytes, and at most {MAX_TEXT_BYTES} are allowed")
-    return await _exactly(connection, length)
+    return await _receive_exactly(connection, length)
 
 
-async def _exactly(connection: socket.socket, count: int) -> bytes:
+async def _receive_exactly(connection: socket.socket, count: int) -> bytes:
     loop = asyncio.get_running_loop()
     data = b""
     while len(data) < count:

@@ -64,9 +64,9 @@ class AttackEntries:
         known.
         """
         for entry, message in self._lies:
-            entry["lie"] |= self._said(message)
+            entry["lie"] |= self._message_keys(message)
 
-    def _said(self, message: Message) -> Document:
+    def _message_keys(self, message: Message) -> Document:
         said: Document = {"message": message.NAME}
         block_hash = block_named(message)
         if block_hash is not None:

@@ -92,7 +92,7 @@ class CoverageWatcher:
         number = held.number(shape)
         reached.states.add(number)
         if self._held_before is not None and (number != self._number_before or self._answers):
-            given = _given(self._input, self._held_before)
+            given = _described_input(self._input, self._held_before)
             if given is not None:
                 reached.pairs.add(self._held_before.number((self._shape_before, given)))
         self._number_before, self._shape_before, self._held_before = number, shape, held
@@ -110,7 +110,7 @@ class CoverageWatcher:
         return held
 
 
-def _given(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
+def _described_input(run: HandlerRun | None, held: HeldBlockOrder) -> tuple[Any, ...] | None:
     """Return a description of an input that is the same in every run with the same blocks in the same order. `held`
     contains the blocks that the agent held before the input. Return None for an input that does not exist in any proof.
     """

@@ -27,11 +27,11 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 
 LOOK_EVERY = 500
 
-Alone = tuple[int, int, int, int]
+SingleAgentState = tuple[int, int, int, int]
 """The state of an agent that is explored alone: its ID, its local state, its zone (the possible remaining times of its
 timers), and the number of blocks that it has completed.
 """
-Said = tuple[int, int]
+SentMessage = tuple[int, int]
 """A sent message: the number of the sender and the number of the message."""
 
 
@@ -128,19 +128,21 @@ class _BlockDistribution:
         }
         self.local = LocalStates(bounds)
         self._zones = ZoneTable()
-        self._came_from: dict[Alone, tuple[Alone, str] | None] = {}
-        self._said: dict[Said, None] = {}
+        self._came_from: dict[SingleAgentState, tuple[SingleAgentState, str] | None] = {}
+        self._said: dict[SentMessage, None] = {}
         self._names: dict[int, frozenset[int]] = {}
-        self._by_agent: dict[int, list[Alone]] = {agent_id: [] for agent_id in self._own if agent_id != bounds.captured}
+        self._by_agent: dict[int, list[SingleAgentState]] = {
+            agent_id: [] for agent_id in self._own if agent_id != bounds.captured
+        }
         self._heard = None if bounds.captured is None else AttackerKnowledge(bounds, self._own[bounds.captured])
         """The knowledge of the attacker, who can send at any moment. From the beginning, the attacker has the blocks of
         the captured vehicle.
         """
-        self._lied: dict[int, tuple[ForgeryMaterial, int]] = {}
+        self._delivered_forgeries: dict[int, tuple[ForgeryMaterial, int]] = {}
         """Agent -> the data from which the last forged messages to the agent were made, and a number. The forged
         messages were delivered to this number of states of the agent.
         """
-        self._looked_at = 0
+        self._explored = 0
         """Number of states whose own actions were explored. An own action needs no received message."""
 
     def collect(self, began: float) -> Iterator[ExplorationProgress]:
@@ -151,7 +153,7 @@ class _BlockDistribution:
             local = self.local.initial[agent_id]
             self._add((agent_id, local, NOTHING_RUNS, 0), None)
         acted = dict.fromkeys(self._by_agent, 0)
-        heard: dict[Said, int] = {}
+        heard: dict[SentMessage, int] = {}
         busy = True
         while busy:
             busy = False
@@ -159,7 +161,7 @@ class _BlockDistribution:
                 while acted[agent_id] < len(states):
                     self._act(states[acted[agent_id]])
                     acted[agent_id] += 1
-                    self._looked_at += 1
+                    self._explored += 1
                     busy = True
                 for said in list(self._said):
                     if said[0] == agent_id:
@@ -172,24 +174,24 @@ class _BlockDistribution:
                     self._attacker_hears(said)
                     yield ExplorationProgress(
                         earlier + len(self._came_from),
-                        collected.looked_at + self._looked_at,
+                        collected.looked_at + self._explored,
                         collected.transitions,
                         collected.divisions,
                         time.monotonic() - began,
                     )
-                busy |= self._lied_to(agent_id, states)
+                busy |= self._deliver_forgeries(agent_id, states)
 
     def count(self) -> None:
         """Add the numeric results of this distribution to the totals, even if its exploration is incomplete."""
         collected = self._collected
         collected.states += len(self._came_from)
-        collected.looked_at += self._looked_at
+        collected.looked_at += self._explored
         collected.said += len(self._said)
         collected.local_states += len(self.local.known)
         collected.steps += self.local.steps
         collected.zones += len(self._zones)
 
-    def _add(self, state: Alone, came_from: tuple[Alone, str] | None) -> None:
+    def _add(self, state: SingleAgentState, came_from: tuple[SingleAgentState, str] | None) -> None:
         if state in self._came_from:
             return
         self._came_from[state] = came_from
@@ -204,7 +206,7 @@ class _BlockDistribution:
         if known.deceived:
             collected.shown.add("4")
 
-    def _act(self, state: Alone) -> None:
+    def _act(self, state: SingleAgentState) -> None:
         """Explore the steps of an agent that need no message, such as the expiry of a timer."""
         agent_id, local, zone, completed = state
         if self._known_flaw(local):
@@ -222,7 +224,7 @@ class _BlockDistribution:
         if "reboot" in self._bounds.faults:
             self._go(state, self.local.reboot(local), "it reboots", forgets=True)
 
-    def _hear(self, state: Alone, said: Said) -> None:
+    def _hear(self, state: SingleAgentState, said: SentMessage) -> None:
         agent_id, local, _, completed = state
         if self._known_flaw(local) or not self._named(said[1]).isdisjoint(self._own[agent_id][completed:]):
             return
@@ -231,25 +233,25 @@ class _BlockDistribution:
         if step.local != local or step.sent or step.started:
             self._go(state, step, f"it hears a {self.local.messages[said[1]].NAME} from agent {said[0]}")
 
-    def _attacker_hears(self, said: Said) -> None:
+    def _attacker_hears(self, said: SentMessage) -> None:
         if self._heard is not None:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
-    def _lied_to(self, agent_id: int, states: list[Alone]) -> bool:
+    def _deliver_forgeries(self, agent_id: int, states: list[SingleAgentState]) -> bool:
         """Let the attacker send each possible message to an agent in each of these states. Return true if any of these
         messages is new.
         """
         if self._heard is None:
             return False
-        material, before = self._heard.material(agent_id), self._lied.get(agent_id)
+        material, before = self._heard.material(agent_id), self._delivered_forgeries.get(agent_id)
         done = 0 if before is None or before[0] != material else before[1]
         for state in states[done:]:
             for message in self._heard.forgeries(self.local.state(state[1]), material):
-                self._lie(state, self.local.message(message))
-        self._lied[agent_id] = material, len(states)
+                self._deliver_forgery(state, self.local.message(message))
+        self._delivered_forgeries[agent_id] = material, len(states)
         return done < len(states)
 
-    def _lie(self, state: Alone, message: int) -> None:
+    def _deliver_forgery(self, state: SingleAgentState, message: int) -> None:
         agent_id, local, _, completed = state
         if self._known_flaw(local) or not self._named(message).isdisjoint(self._own[agent_id][completed:]):
             return
@@ -271,7 +273,7 @@ class _BlockDistribution:
 
     def _go(
         self,
-        state: Alone,
+        state: SingleAgentState,
         step: AgentStep,
         what: str,
         *,

@@ -71,7 +71,7 @@ class CanonicalOrder:
             orders = list(islice(self._orders(locals_, zone, timers), MOST_ORDERS))
         places = orders[0]
         if len(orders) > 1:
-            places = min(orders, key=lambda places: self._looks(locals_, zone, timers, places))
+            places = min(orders, key=lambda places: self._described_in_order(locals_, zone, timers, places))
         if places != self._as_they_are:
             agents = tuple([self._renamed(locals_[old], new, places) for new, old in enumerate(places)])
             if zone:
@@ -195,7 +195,9 @@ class CanonicalOrder:
         """Return the position of the agent for which the agent at `place` uses this ID."""
         return name - 2 if name - 2 < place else name - 1
 
-    def _looks(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places) -> tuple[Any, ...]:
+    def _described_in_order(
+        self, locals_: tuple[int, ...], zone: int, timers: Sequence[range], places: Places
+    ) -> tuple[Any, ...]:
         """Return a description of the state with this order of the agents. If two orders have equal descriptions, the
         states are equal.
         """

@@ -153,7 +153,7 @@ class InstantOutcomes:
             agents[place] = step.local
             if action.what in ("death", "reboot", "captured"):
                 started[place] = ()
-            started[place] = self._still(started[place], step)
+            started[place] = self._still_running(started[place], step)
             air += [(place, message) for message in step.sent]
         waiting: dict[tuple[AgentStates, _Said], FinalMessageRound]
         waiting = {(AgentStates(tuple(agents), tuple(started)), tuple(air)): FinalMessageRound(0, None)}
@@ -220,7 +220,7 @@ class InstantOutcomes:
         choices = known[agent] = [
             (
                 step.local,
-                self._still(before, step),
+                self._still_running(before, step),
                 tuple((place, message) for message in step.sent),
                 tuple(mine[position] for position in order),
                 len(mine) - len(set(order)) if lossy and self._counts_losses else 0,
@@ -229,7 +229,7 @@ class InstantOutcomes:
         ]
         return choices
 
-    def _still(self, before: Started, step: AgentStep) -> Started:
+    def _still_running(self, before: Started, step: AgentStep) -> Started:
         """Return the timers that an agent started in the current instant and that are still running."""
         if not before and not step.started:
             return ()
@@ -328,7 +328,7 @@ class InstantOutcomes:
                 for other in earlier[position]:
                     still[other] = 0
                 after = (
-                    AgentStep(step.local, tuple(sorted(sent + step.sent)), self._still(started, step)),
+                    AgentStep(step.local, tuple(sorted(sent + step.sent)), self._still_running(started, step)),
                     tuple(still),
                 )
                 if after not in orders:

@@ -130,7 +130,7 @@ class KnownStates:
         """Return the number of the state to which `renamed` with these IDs would give this state. It undoes the
         renaming.
         """
-        return self.renamed(local, _back(names))
+        return self.renamed(local, _inverse(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
         """Return new IDs for the other agents, as an agent sees them: counted agents come first, and the sender
@@ -144,7 +144,7 @@ class KnownStates:
             return None
         tallies = [known.snapshot[name] for name in NAMES_OF_OTHERS]
         in_order = sorted(self.others, key=lambda other: (*(other not in tally for tally in tallies), other != sender))
-        return None if tuple(in_order) == self.others else _back(tuple(in_order))
+        return None if tuple(in_order) == self.others else _inverse(tuple(in_order))
 
     def first_names(self, local: int, senders: Sequence[int]) -> Names | None:
         """Return new IDs for the other agents that put these senders first, in their order. Return None if no change is
@@ -156,14 +156,14 @@ class KnownStates:
         if not self._nameless or known.names_others or known.flaw is not None:
             return None
         in_order = tuple(dict.fromkeys((*senders, *self.others)))
-        return None if in_order == self.others else _back(in_order)
+        return None if in_order == self.others else _inverse(in_order)
 
     def _names_others(self, snapshot: Snapshot) -> bool:
         """Return true if the agent has counted the votes or answers of some other agents but not of all."""
         return any(0 < len(snapshot[name]) < len(self.others) for name in NAMES_OF_OTHERS)
 
 
-def _back(names: Names) -> Names:
+def _inverse(names: Names) -> Names:
     """Return the new IDs that undo this renaming of agents."""
     before = {name: other for other, name in enumerate(names, FIRST_OTHER)}
     return tuple(before[name] for name in sorted(names))

@@ -223,18 +223,18 @@ def _copied(value: Any) -> Any:
     return copy(value)
 
 
-def _itself(value: Any) -> Any:
+def _unchanged(value: Any) -> Any:
     return value
 
 
-def _each(value: Any) -> Any:
+def _copied_items(value: Any) -> Any:
     return type(value)(map(_copied, value))
 
 
 _COPIED: dict[type, Callable[[Any], Any]] = {
-    **dict.fromkeys((type(None), bool, int, bytes, str, float, Block, _TimerState, _ChainState), _itself),
+    **dict.fromkeys((type(None), bool, int, bytes, str, float, Block, _TimerState, _ChainState), _unchanged),
     **dict.fromkeys((set, bytearray, Counter), lambda value: value.copy()),
-    **dict.fromkeys((list, deque, tuple), _each),
+    **dict.fromkeys((list, deque, tuple), _copied_items),
     dict: lambda value: {key: _copied(item) for key, item in value.items()},
     Timer: _TimerState,
     Chain: _ChainState.of,

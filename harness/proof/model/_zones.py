@@ -135,7 +135,9 @@ class ZoneTable:
             after = self._ended(zone, ended)
             assert after is not None, "these timers can end at once"
             timers = range(1, len(before))
-            self._coincidences[key] = _apart(before, timers) - _apart(after, range(len(before)))
+            self._coincidences[key] = _count_independent_groups(before, timers) - _count_independent_groups(
+                after, range(len(before))
+            )
         return self._coincidences[key]
 
     def _ended(self, zone: int, ended: Sequence[int]) -> list[list[int]] | None:
@@ -181,7 +183,7 @@ class ZoneTable:
         return number
 
 
-def _apart(matrix: Sequence[Sequence[int]], timers: range) -> int:
+def _count_independent_groups(matrix: Sequence[Sequence[int]], timers: range) -> int:
     """Return the number of groups of timers. In a group, the differences of the remaining times are fixed."""
     return sum(
         not any(matrix[timer][other] + matrix[other][timer] == 0 for other in timers if other < timer)

@@ -159,7 +159,7 @@ class _IncarnationEncoder:
         if run.algorithm != algorithm:
             algorithm = NO_HANDLER
         try:
-            came, is_for_nobody = self._came(run)
+            came, is_for_nobody = self._encoded_input(run)
             changes = self._changes(run)
             sent = tuple(map(self._sent, run.sent))
             top = self._chain(_digest(run.state.top))
@@ -183,7 +183,7 @@ class _IncarnationEncoder:
             ),
         )
 
-    def _came(self, run: HandlerRun) -> tuple[Item, bool]:
+    def _encoded_input(self, run: HandlerRun) -> tuple[Item, bool]:
         """Return the encoded input of a handler run, and true if the agent must drop this input. Raises ValueError if
         the input is invalid.
         """

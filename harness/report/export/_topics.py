@@ -153,15 +153,16 @@ class TopicConverter:
         received = run.trigger if isinstance(run.trigger, MessageTrigger) else None
         return {
             "handler": run.handler,
-            "algorithm": _whole(run.algorithm),
+            "algorithm": _exact_integer(run.algorithm),
             "branch": run.branch,
             "trigger": trigger,
             "trigger_name": None if name is None else str(name),
-            "sender": _whole(received and received.sender),
-            "seq": _whole(received and received.sequence),
+            "sender": _exact_integer(received and received.sender),
+            "seq": _exact_integer(received and received.sequence),
             "changes": [{"operation": operation, **self._block(block)} for operation, block in run.changes],
             "sent": [
-                {"message": sent.message, "seq": _whole(sent.seq), **self._block(sent.block)} for sent in run.sent
+                {"message": sent.message, "seq": _exact_integer(sent.seq), **self._block(sent.block)}
+                for sent in run.sent
             ],
         }
 
@@ -170,7 +171,7 @@ class TopicConverter:
         length = run.state.chain - sum(1 if operation == "chain+" else -1 for operation, _ in changes)
         for operation, block in changes:
             length += 1 if operation == "chain+" else -1
-            values = {"length": _whole(length), "operation": "added" if operation == "chain+" else "taken off"}
+            values = {"length": _exact_integer(length), "operation": "added" if operation == "chain+" else "taken off"}
             yield f"/agents/{agent}/chain", "ucp.ChainChange", values | self._block(block) | {"handler": run.handler}
 
     def _block(self, block_hash: str | None) -> Object:
@@ -185,9 +186,9 @@ def _is_plottable(value: Any) -> bool:
 def _state(run: HandlerRun) -> Object:
     state = run.state
     return {
-        "chain": _whole(state.chain),
-        "deque": _whole(state.deque),
-        "stack": _whole(state.stack),
+        "chain": _exact_integer(state.chain),
+        "deque": _exact_integer(state.deque),
+        "stack": _exact_integer(state.stack),
         "reconciling": state.reconciling,
         "idle": state.idle,
         "top_chain_hash": state.top,
@@ -198,7 +199,7 @@ def _link(link: Link) -> str:
     return f"loss_{link[0]}_to_{link[1]}"
 
 
-def _whole(number: Any) -> int | None:
+def _exact_integer(number: Any) -> int | None:
     """Return the number if it is an integer that all tools show exactly. Return None for any other number."""
     return number if isinstance(number, int) and abs(number) <= _LARGEST else None
 

@@ -105,7 +105,7 @@ def compare(before: Sequence[Cell], now: Sequence[Cell]) -> Iterator[Change]:
         if cell.point not in earlier:
             continue
         for metric, was, is_now in _both(earlier[cell.point], cell):
-            direction = _moved(was, is_now)
+            direction = _direction_of_change(was, is_now)
             if direction and metric.worse:
                 worse = direction == metric.worse
                 yield Change(**cell.point._asdict(), metric=metric.name, before=was, now=is_now, worse=worse)
@@ -175,7 +175,7 @@ def _differences(metric: Metric, pairs: Sequence[tuple[Run, Run]]) -> list[float
     return [after - before for before, after in values if before is not None and after is not None]
 
 
-def _moved(before: Estimate, now: Estimate) -> str | None:
+def _direction_of_change(before: Estimate, now: Estimate) -> str | None:
     """Return the direction of a change if the two confidence intervals do not overlap. Return None if they overlap."""
     if before.low is None or before.high is None or now.low is None or now.high is None:
         return None

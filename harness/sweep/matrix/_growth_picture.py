@@ -83,10 +83,10 @@ def draw_growth(record: MatrixRecord) -> str:
     return svg.document(
         HEAD + math.ceil(len(panels) / COLUMNS) * PANEL_HEIGHT + FOOT,
         record.matrix.name,
-        _about(record),
+        _subtitle(record),
         description(record),
         [_legend(record), *drawn],
-        _foot(record),
+        _footnote(record),
         ids="growth-",
     )
 
@@ -104,14 +104,14 @@ def description(record: MatrixRecord) -> str:
     parts = []
     for panel in panels_of(record.matrix):
         for line in _lines(record, panel):
-            values = (f"{_say(panel, cell)} at {_at(panel, cell)}" for cell in line.cells)
+            values = (f"{_value_text(panel, cell)} at {_at(panel, cell)}" for cell in line.cells)
             about = ", ".join(filter(None, (_title(record, panel), line.name)))
             power = f" (exponent {say_exponent(line.law.exponents[panel.over])})" if line.law else ""
             parts.append(f"{about}{power}: {', '.join(values)}.")
     return " ".join(parts)
 
 
-def _about(record: MatrixRecord) -> str:
+def _subtitle(record: MatrixRecord) -> str:
     matrix = record.matrix
     agents = [point.agents for point in matrix.points]
     parts = [
@@ -125,7 +125,7 @@ def _about(record: MatrixRecord) -> str:
     return " \u00b7 ".join(parts)
 
 
-def _foot(record: MatrixRecord) -> str:
+def _footnote(record: MatrixRecord) -> str:
     runs = max((cell.runs for cell in record.cells), default=0)
     dots = f"means of {runs} runs" if runs > 1 else "one run each"
     return f"Over N agents or B blocks. Dots: {dots}; lines: fitted power laws with their exponents."
@@ -206,7 +206,7 @@ def _name(matrix: Matrix, losses: Sequence[float], place: ChartLineKey) -> str:
 
 def _panel(record: MatrixRecord, panel: GrowthPanel, area: ChartArea) -> Markup:
     lines = _lines(record, panel)
-    across, up = _across(panel, lines, area), _up(panel, lines, area)
+    across, up = _across(panel, lines, area), _vertical_axis(panel, lines, area)
     frame = svg.frame(
         _title(record, panel),
         across,
@@ -232,7 +232,7 @@ def _line(panel: GrowthPanel, line: PanelLine, across: Axis, up: Axis) -> Markup
     parts = [svg.line([(across(x), up(y)) for x, y in ends], line.number)] if ends else []
     for x, y, cell in points:
         about = ", ".join(filter(None, (_at(panel, cell), line.name)))
-        parts.append(svg.dot(across(x), up(y), line.number, f"{about}: {_say(panel, cell)}"))
+        parts.append(svg.dot(across(x), up(y), line.number, f"{about}: {_value_text(panel, cell)}"))
     return Markup('<g class="series {}">{}</g>').format(svg.CLASSES[line.number], Markup("").join(parts))
 
 
@@ -273,7 +273,7 @@ def _across(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> 
     return replace(axis, ticks=ticks)
 
 
-def _up(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
+def _vertical_axis(panel: GrowthPanel, lines: Sequence[PanelLine], area: ChartArea) -> Axis:
     if panel.shares:
         return svg.share_axis(area.up)
     ys = [y for line in lines for cell in line.cells if (y := _y(panel, cell))]
@@ -301,7 +301,7 @@ def _at(panel: GrowthPanel, cell: Cell) -> str:
     return f"{say_number(_x(panel, cell) or 0.0)} {panel.over}"
 
 
-def _say(panel: GrowthPanel, cell: Cell) -> str:
+def _value_text(panel: GrowthPanel, cell: Cell) -> str:
     return say(GROWTH_BY_NAME[panel.metric], cell.estimates.get(panel.metric, Estimate(n=0)))
 
 

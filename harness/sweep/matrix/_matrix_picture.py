@@ -96,7 +96,7 @@ def draw(record: MatrixRecord) -> str:
         parts += [_panel(placed, row.cells) for placed in row.panels]
     last = rows[-1].panels[-1].area
     bottom = last.y + last.height + FOOT
-    return svg.document(bottom, record.matrix.name, _about(record), description(record), parts, _legend(record))
+    return svg.document(bottom, record.matrix.name, _subtitle(record), description(record), parts, _legend(record))
 
 
 def _heading(name: str, top: float) -> Markup:
@@ -129,12 +129,12 @@ def description(record: MatrixRecord) -> str:
             parts.append(f"{series_is}:")
         for panel in PANELS:
             for name, line in panel.lines:
-                values = (f"{_say(name, cell)} at {text.percent(cell.loss)}" for cell in cells)
+                values = (f"{_value_text(name, cell)} at {text.percent(cell.loss)}" for cell in cells)
                 parts.append(f"{panel.title}{f' ({line})' if line else ''}: {', '.join(values)}.")
     return " ".join(parts)
 
 
-def _about(record: MatrixRecord) -> str:
+def _subtitle(record: MatrixRecord) -> str:
     agents = sorted({point.agents for point in record.matrix.points})
     simulated = "simulated " if in_virtual_time(record.backend) else ""
     parts = [
@@ -170,7 +170,7 @@ def _panel(placed: PlacedPanel, cells: Sequence[Cell]) -> Markup:
 def _line(number: int, name: str, label: str, cells: Sequence[Cell], across: Axis, up: Axis) -> Markup:
     """Draw a line, and write its name next to its middle."""
     known = [
-        LinePoint(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_say(name, cell)}")
+        LinePoint(cell.loss, cell.estimates[name], f"{text.percent(cell.loss)} loss: {_value_text(name, cell)}")
         for cell in cells
     ]
     drawing, points = curve(number, known, across, up)
@@ -222,5 +222,5 @@ def _value_axis(panel: ChartPanel, cells: Sequence[Cell], area: ChartArea) -> Ax
     return svg.linear_axis(0.0, math.ceil(highest / step - 1e-9) * step, area.up)
 
 
-def _say(name: str, cell: Cell) -> str:
+def _value_text(name: str, cell: Cell) -> str:
     return say(BY_NAME[name], cell.estimates[name])

@@ -202,7 +202,7 @@ class ForeignAgent:
                 self._status = AgentStatus.model_validate(command_answer)
             except ValidationError as error:
                 raise self._failure(
-                    "crashed", f"its answer to the command status lacks a valid {_where(error)}"
+                    "crashed", f"its answer to the command status lacks a valid {_path_of_error(error)}"
                 ) from None
         return self._status
 
@@ -226,7 +226,9 @@ class ForeignAgent:
         try:
             read = Export.model_validate(export)
         except ValidationError as error:
-            raise self._failure("crashed", f"its answer to the command export lacks a valid {_where(error)}") from None
+            raise self._failure(
+                "crashed", f"its answer to the command export lacks a valid {_path_of_error(error)}"
+            ) from None
         if read.agent_id != self.agent_id:
             raise self._failure("crashed", f"answered the command export with the export of agent {read.agent_id}")
         if read.inception.block_data != in_base64(self.initial_data):
@@ -353,6 +355,6 @@ def _changes(entries: list[Entry]) -> Iterator[tuple[str, str]]:
     return (change for entry in entries if isinstance(entry, HandlerRun) for change in entry.changes)
 
 
-def _where(error: ValidationError) -> str:
+def _path_of_error(error: ValidationError) -> str:
     """Return the path of the first invalid key in an answer of the agent."""
     return f"`{'.'.join(str(part) for part in error.errors()[0]['loc'])}`"

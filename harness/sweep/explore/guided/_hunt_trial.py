@@ -241,7 +241,7 @@ def with_liveness_phase(document: Document) -> Document:
     mission, so that the swarm can become idle.
     """
     ends_s = float(document.get("duration_s", 1200.0))
-    fates = [_until(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
+    fates = [_ending_at(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
     entries = [entry for entry in timeline(document) if entry["at_s"] < ends_s - 3 * CLEARED_S]
     clear: Document = {"loss": 0.0} if at(document, "network.loss") or _loses(entries) else {}
     clear |= {"duplicate": 0.0} if at(document, "network.duplicate") else {}
@@ -270,7 +270,7 @@ def _over_by(entry: Document, last_s: float) -> Document:
     return entry
 
 
-def _until(fate: Document, ends_s: float) -> Document:
+def _ending_at(fate: Document, ends_s: float) -> Document:
     if "arrivals" in fate:
         return fate
     return {**fate, "until_s": min(ends_s, fate.get("until_s", ends_s))}

@@ -239,17 +239,17 @@ class _NightRun:
         if not hunt.kept:
             reason = hunt.failed[0][1] if hunt.failed else "no run of the scenario can be changed and played"
             raise HarnessError(f"the hunt has no run to start from: {reason}")
-        for candidate in () if self._over else before:
+        for candidate in () if self._is_over else before:
             if id(candidate) not in kept:
                 self._corpus.drop(candidate)
-        while not self._over:
+        while not self._is_over:
             for _ in self._kept_runs(hunt.round(self._jobs)):
                 pass
             for candidate in hunt.dropped():
                 self._corpus.drop(candidate)
 
     @property
-    def _over(self) -> bool:
+    def _is_over(self) -> bool:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
@@ -263,7 +263,7 @@ class _NightRun:
             for identity in hunt.found.keys() - self._known.keys() - self._new.keys():
                 self._add_finding(identity, hunt.found[identity])
             self._watcher.on_progress(hunt.runs, hunt.local_states, len(hunt.found))
-            if self._over:
+            if self._is_over:
                 return
 
     def _add_finding(self, identity: FindingIdentity, candidate: CandidateRun) -> None:
