@@ -63,7 +63,7 @@ class VirtualSwitch:
         return {vehicle: os.fstat(namespace).st_ino for vehicle, namespace in self._namespaces.items()}
 
     def _namespace(self, vehicle: int) -> NetlinkSocket:
-        """Create the network namespace of a vehicle unless it exists. Return a netlink socket inside it."""
+        """Return a netlink socket in the network namespace of a vehicle. If the namespace does not exist, create it."""
         if vehicle in self._namespaces:
             _namespaces.enter_network(self._namespaces[vehicle])
         else:

@@ -88,8 +88,8 @@ ROGUE_CONTROL = "rogue.control"
 class RunDirectory:
     """The directory of a run in progress. Backends create files in it, and the mission appends its records.
 
-    Raises RunDirectoryError if the directory cannot be made or is not empty. Methods that write raise OSError on a disk
-    error, unless they document another error.
+    Raises RunDirectoryError if the directory cannot be made or is not empty. A method that writes raises OSError on a
+    disk error, or the error that its docstring names.
     """
 
     def __init__(self, path: Path) -> None:

@@ -158,7 +158,8 @@ class RecordFile:
 def read_record(path: Path) -> RecordFile:
     """Read the file run.json at `path`. If no part of it can be used, the result has an `error`.
 
-    The error is a DamagedRecordError, unless the file is intact but has a different schema.
+    The error is a DamagedRecordError if the file is damaged. It is of another class if the file is intact but has a
+    different schema.
     """
     try:
         return _read(path)

@@ -9,9 +9,8 @@ from harness.scenario import Scenario, load_scenario
 
 
 def load_recorded_scenario(path: Path) -> tuple[Scenario, int | None]:
-    """Return a scenario and its seed. `path` is a scenario file, the name of an included scenario, or a run directory.
-
-    The seed is None unless `path` is a run directory. Raises HarnessError.
+    """Return a scenario and its seed. `path` is a run directory, a scenario file, or the name of an included scenario.
+    Only a run directory has a seed. Otherwise the seed is None. Raises HarnessError.
     """
     if not (path / RUN_FILE).is_file():
         return load_scenario(path), None

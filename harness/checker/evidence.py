@@ -151,7 +151,7 @@ class Evidence:
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[UnverifiedSignature], bool] | None" = None
     """A function that returns true if the signature is already known to be valid, so that the checker need not compute
-    it. None unless this process simulated the swarm.
+    it. Only available for a swarm that this process simulated, otherwise None.
     """
     watch: Watch | None = None
     """A function that receives each step that the step judge examines."""

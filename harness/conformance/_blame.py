@@ -102,8 +102,8 @@ class BlameEvidence:
         return BlamedBranch(run.handler, run.branch)
 
     def _fails_without_preceding_input(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the failed test had an ignored answer before a timer expiry, and the same expiry without this
-        answer has passed in no test.
+        """Return true if the ignored answer before the timer expiry is probably not the cause of the failure. This is
+        so if no test passed in which the timer expired in the same state without this answer.
         """
         key = failure.observation.key
         if INPUTS[key.input].preceding is None:

@@ -156,8 +156,8 @@ class Proof:
 
     @property
     def decided(self) -> bool:
-        """True if every property was decided: neither a limit, the user nor a violation ended the search early, and no
-        question was left open.
+        """True if every property was decided. It is false if a limit, the user or a violation ended the search early,
+        or if a question was left open.
         """
         whole = self.whole_ended == "complete" and (self.liveness is None or self.liveness.decided)
         return self.complete and whole and not self.left_open

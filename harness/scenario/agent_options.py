@@ -34,7 +34,7 @@ file."""
 
 
 def _commands(asked: Any) -> Any:
-    """Raise ValueError unless the value is a command, or a mapping from agents to commands.
+    """Check that the value is a command, or a mapping from agents to commands. Raises ValueError.
 
     Without this check, pydantic would report one error for each member of the union.
     """

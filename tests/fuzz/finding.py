@@ -46,7 +46,7 @@ def bounded() -> Iterator[None]:
 
 
 def sound(sentence: str) -> None:
-    """Raise FailedError unless the error message is one short line without a traceback."""
+    """Check that an error message is one short line without a traceback. Raises FailedError."""
     require(len(sentence) < LONGEST_SENTENCE, f"a sentence of {len(sentence)} characters: {sentence[:200]}")
     require("\n" not in sentence, f"more than a sentence: {sentence[:200]}")
     require("Traceback" not in sentence, f"a traceback: {sentence[:200]}")

@@ -52,7 +52,7 @@ class BlockSignatures:
         return True
 
     def forget_unless_held(self, block: Block) -> None:
-        """Discard the signature of a received block unless the agent holds the block."""
+        """Discard the signature of a received block if the agent does not hold the block."""
         if not self._state.holds(block.block_hash):
             self._by_hash.pop(block.block_hash, None)
 

@@ -30,10 +30,12 @@ class DatagramOpener:
         self._keys: dict[tuple[int, int, bytes], SenderKeys] = {}
 
     def open(self, datagram: bytes) -> OpenedDatagram:
-        """Return the content of a datagram.
+        """Return the content of a datagram. Raises MalformedDatagramError for a datagram of these kinds:
 
-        Raises MalformedDatagramError if the datagram has no message because it is a control datagram, is not authentic,
-        belongs to an epoch before the bundle's, or comes from a sender that is not on the roster.
+        - a control datagram, which contains no message
+        - a datagram that is not authentic
+        - a datagram whose sender is not on the roster
+        - a datagram of an epoch before that of the bundle, or more than `EPOCHS_AHEAD` epochs later
         """
         clear = read_clear_header(datagram)
         if clear.type in CONTROL_NAMES:

@@ -54,7 +54,9 @@ class Revocation:
 
     @classmethod
     def decode(cls, body: bytes, authority: bytes, mission: bytes) -> Self:
-        """Parse a revocation from the body of a message. Raises RevocationError unless the authority signed it."""
+        """Parse a revocation from the body of a message. Raises RevocationError if the body is malformed, or if the
+        signature of the authority is missing or wrong.
+        """
         if not _HEAD.size <= len(body) <= _HEAD.size + 4 * MAX_REVOKED + _SIGNATURE_BYTES:
             raise RevocationError("it has the wrong length")
         number, count = _HEAD.unpack_from(body)

@@ -75,7 +75,7 @@ class Position(NamedTuple):
 
     @classmethod
     def unpack(cls, data: bytes) -> "Position":
-        """Parse the data of a position event. Raises struct.error unless `data` has 64 bytes."""
+        """Parse the data of a position event, which are 64 bytes. Raises struct.error for any other length."""
         return cls._make(_POSITION_DATA.unpack(data))
 
 

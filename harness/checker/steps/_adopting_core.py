@@ -31,7 +31,7 @@ class StateBeforeStep(NamedTuple):
 
     stack: list[Block]
     current_block: bytes | None
-    """The block under construction before the step. None unless the step logs an event."""
+    """The block under construction before a step that logs an event. None for any other step."""
     phase_three_ends: float | None
 
 

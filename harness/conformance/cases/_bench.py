@@ -68,7 +68,7 @@ def case(name: str, section: str, algorithm: int = 0) -> Callable[[Callable[["Ca
 
 
 def require(true: bool, expected: str, received: object) -> None:
-    """Raise WrongBehaviourError unless the condition is true."""
+    """Raise WrongBehaviourError if the condition is false."""
     if not true:
         raise WrongBehaviourError(expected, f"came {received}")
 
@@ -127,8 +127,9 @@ class BenchAgent:
         require(not received, f"nothing {why}", _names(received))
 
     async def require_single_answer(self, top: bytes, after: str) -> None:
-        """Ask the agent whether its chain contains this chain hash. Raises WrongBehaviourError unless the next message
-        of the agent is the answer yes. A late answer to an earlier message therefore also raises this error.
+        """Ask the agent whether its chain contains this chain hash. The next message of the agent must be the answer
+        yes. Any other message raises WrongBehaviourError, so a late answer to an earlier message also raises this
+        error.
         """
         self.send(2 if self.agent_id != 2 else 3, ChainContainQuery(top))
         (received,) = await self.receive(1, f"an answer to a Chain Contain Query after {after}")

@@ -106,7 +106,7 @@ class Simulation(EventLoop):
         self.failures: list[AgentFailedError] = []
         """The failures of agents that crashed or hung, in the order of time."""
         self._failed_incarnations: list[list[AgentFailure]] = [[] for _ in self.roster]
-        """The records of the failures of each agent."""
+        """The failures of each agent, for run.json. The agents have the order of the roster."""
         self._reach = RadioRange(scenario)
         self._tracks = tracks_of(scenario)
         self._move_every_s = radio.update_s if (radio := scenario.network.radio) else TRACK_S

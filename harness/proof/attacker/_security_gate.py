@@ -35,7 +35,7 @@ class SecurityGate:
         self._roster = tuple(roster)
         self._captured = captured
         self._sequence = 0
-        self._mouths: dict[int, Session] = {}
+        self._sessions: dict[int, Session] = {}
         """Sender -> the session in which the attacker sends in the name of this sender."""
 
     def agent(self, agent_id: int, *arguments: Any, revoked: bool = False, **options: Any) -> Agent:
@@ -56,8 +56,9 @@ class SecurityGate:
         """Return a new encrypted datagram with this message, in the name of the captured vehicle or of `sender`.
 
         If `genuine` is true, the block in the message has the signature of its author, which the attacker received
-        together with the block. Otherwise the attacker signs the block with the captured key. An answer names a request
-        that no agent has received, so no agent knows a newer request.
+        together with the block. Otherwise the attacker signs the block with the captured key. If the message is an
+        answer, the datagram says that it answers a new request of the captured vehicle, which no agent has received. No
+        agent can therefore know a newer request.
         """
         from ucp.secure.block_signature import sign_block
         from ucp.secure.sealed_datagrams import AnsweredRequest
@@ -65,10 +66,10 @@ class SecurityGate:
 
         self._sequence += 1
         sender = sender or self._captured
-        if sender not in self._mouths:
+        if sender not in self._sessions:
             bundle = replace(self._keys.bundle(self._captured), agent_id=sender)
-            self._mouths[sender] = Session(bundle, ATTACKERS_BOOT)
-        session = self._mouths[sender]
+            self._sessions[sender] = Session(bundle, ATTACKERS_BOOT)
+        session = self._sessions[sender]
         session.epochs.set_clock(now)
         signature = None
         if type(message) in CARRY_A_BLOCK:

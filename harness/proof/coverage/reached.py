@@ -61,8 +61,8 @@ class ReachedStates:
 
 
 class CoverageWatcher:
-    """A recorder of the states, pairs and branches that an agent has reached after each judged step. Callers may
-    replace `reached`.
+    """A recorder of an agent's states, pairs and branches. After each judged step, it adds them to `reached`. Callers
+    may replace `reached`.
     """
 
     def __init__(self) -> None:

@@ -194,7 +194,7 @@ class LocalStates(KnownStates):
         key = local, -4, message
         step = self._steps.get(key)
         if step is None:
-            flaw = self._got_in(local, message)
+            flaw = self._wrongly_accepted(local, message)
             captured, said = self.bounds.captured, self.messages[message]
             step = self._steps[key] = self._computed(
                 local,
@@ -205,7 +205,7 @@ class LocalStates(KnownStates):
             )
         return step
 
-    def _got_in(self, local: int, message: int) -> PropertyViolation | None:
+    def _wrongly_accepted(self, local: int, message: int) -> PropertyViolation | None:
         """Return a violation if the agent accepts a message of the attacker that it must reject. These are messages of
         a revoked vehicle, messages in the name of a third vehicle, and blocks in the receiver's own name. Return None
         if the agent rejects the message.

@@ -101,7 +101,8 @@ MAX_BYTES = 64 * 1024 * 1024
 
 
 def _load(path: Path) -> MatrixRecord:
-    """Load matrix.json. Raises ScenarioError unless it contains finished results of a matrix.
+    """Load matrix.json. Raises ScenarioError if the file cannot be read, has another kind of schema, or belongs to an
+    unfinished matrix.
 
     Raises OtherVersionError if the file has another version of the schema, or does not match its schema.
     """

@@ -52,8 +52,10 @@ SETTINGS = (
 _TIMES_US = (0, 1, 2_000_000, 2**32, 2**63, 2**64 - 1)
 
 
-class _Program:
-    """Reads the bytes of an input one after another. After the end of the input, it reads zeros."""
+class _InputBytes:
+    """The bytes of an input, which are read one after another. After the end, `byte` returns 0 and `take` returns no
+    bytes.
+    """
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -85,7 +87,7 @@ class _DrivenAgent:
     def _born(self) -> tuple[Agent, HeldBlocks]:
         return Agent(1, ROSTER, INITIAL_DATA, self.settings), HeldBlocks()
 
-    def operate(self, program: _Program) -> None:
+    def operate(self, program: _InputBytes) -> None:
         operation = program.byte() % 16
         if operation < 9:
             self._hear(program.byte(), self._message(operation, program))
@@ -130,7 +132,7 @@ class _DrivenAgent:
         if self.agent.dropped.total() > dropped:
             require(_comparable_state(self.agent) == before, "a datagram that was dropped changed the agent")
 
-    def _message(self, kind: int, program: _Program) -> Message:
+    def _message(self, kind: int, program: _InputBytes) -> Message:
         chain_hash = self._chain_hash(program.byte())
         block = self._block(program.byte())
         block_hash = block.block_hash
@@ -225,7 +227,7 @@ def _comparable_state(agent: Agent) -> bytes:
 
 
 def run(data: bytes) -> None:
-    program = _Program(data)
+    program = _InputBytes(data)
     driven = _DrivenAgent(SETTINGS[program.byte() % len(SETTINGS)])
     for _ in range(MOST_OPERATIONS):
         if program.over:

@@ -58,8 +58,10 @@ BEFORE_ITS_SIGNATURE = {
 }
 
 
-class _Program:
-    """Reads the bytes of an input one after another. After the end of the input, it reads zeros."""
+class _InputBytes:
+    """The bytes of an input, which are read one after another. After the end, `byte` returns 0 and `take` returns no
+    bytes.
+    """
 
     def __init__(self, data: bytes) -> None:
         self._data, self._position = data, 0
@@ -96,7 +98,7 @@ class _DrivenAgent:
         session = Session(KEYS.bundle(1), make_boot(self._life, bytes(8)), crypto=self._crypto)
         return SecuredAgent(session, 1, ROSTER, b"fuzz", SETTINGS)
 
-    def operate(self, program: _Program) -> None:
+    def operate(self, program: _InputBytes) -> None:
         operation = program.byte() % 16
         if operation == 0:
             self._receive(program.take(program.byte() * 6))
@@ -120,7 +122,7 @@ class _DrivenAgent:
         else:
             self._reboot()
 
-    def _sealed(self, program: _Program, said: tuple[int, bytes] | bytes) -> bytes:
+    def _sealed(self, program: _InputBytes, said: tuple[int, bytes] | bytes) -> bytes:
         """Return an encrypted datagram of another agent, of any epoch and any incarnation. Its signature may be
         wrong.
         """
@@ -140,7 +142,7 @@ class _DrivenAgent:
         self._said = [*self._said, datagram][-KEPT:]
         return datagram
 
-    def _body(self, program: _Program) -> tuple[int, bytes]:
+    def _body(self, program: _InputBytes) -> tuple[int, bytes]:
         """Return the type and body of a correct message. The message may answer any request."""
         code, choice = 1 + program.byte() % 9, program.byte()
         state = self.agent.state
@@ -165,13 +167,13 @@ class _DrivenAgent:
             body += sign_block(maker, KEYS.public.mission, block.block_data()) if choice & 128 else bytes(64)
         return code, body
 
-    def _damaged(self, program: _Program) -> bytes:
+    def _damaged(self, program: _InputBytes) -> bytes:
         datagram = bytearray(self._said[program.byte() % len(self._said)])
         if datagram:
             datagram[program.byte() * 5 % len(datagram)] ^= program.byte() or 1
         return bytes(datagram)
 
-    def _revocation(self, program: _Program) -> bytes:
+    def _revocation(self, program: _InputBytes) -> bytes:
         who = program.byte()
         authority = KEYS.authority if who % 8 else bytes(32)
         self._number += 1
@@ -264,7 +266,7 @@ def _comparable_state(agent: SecuredAgent) -> dict[str, Any]:
 
 
 def _driven(data: bytes, crypto: CryptoFunctions) -> tuple[object, ...]:
-    program, driven = _Program(data), _DrivenAgent(crypto)
+    program, driven = _InputBytes(data), _DrivenAgent(crypto)
     for _ in range(MOST_OPERATIONS):
         if program.over:
             break

@@ -125,7 +125,7 @@ def test_swarm_that_needs_more_time_has_status_4(tmp_path: Path) -> None:
 SWARM = scenario(agents=3, duration_s=100)
 
 
-class Judged(SilentProgress):
+class StepDisplay(SilentProgress):
     """A display that records the steps of the checker. At one of the steps, it can act like Ctrl-C."""
 
     def __init__(self, interrupted_at: str | None = None) -> None:
@@ -139,7 +139,7 @@ class Judged(SilentProgress):
 
 
 def test_run_shows_each_step_of_its_judging(tmp_path: Path) -> None:
-    judged = Judged()
+    judged = StepDisplay()
     run(SWARM, 1, tmp_path / "run", judged, "sim")
     assert judged.steps == [
         *(f"judging the steps of agent {number}, trace {number} of 3" for number in (1, 2, 3)),
@@ -153,7 +153,7 @@ def test_run_shows_each_step_of_its_judging(tmp_path: Path) -> None:
 def test_run_interrupted_while_judged_can_be_judged_later(tmp_path: Path, step: str) -> None:
     out = tmp_path / "run"
     with pytest.raises(InterruptedRunError) as raised:
-        run(SWARM, 1, out, Judged(step), "sim")
+        run(SWARM, 1, out, StepDisplay(step), "sim")
     assert str(raised.value) == (
         f"interrupted before the verdict; all files of the mission are in {out}: `ucp-harness check {out}` judges them"
     )
