@@ -82,7 +82,7 @@ class CommandLog:
 
 
 def _command(message: Any) -> str | None:
-    """Return the name of the command in a message COMMAND_LONG or COMMAND_INT."""
+    """Return the name of the command in a message COMMAND_LONG or COMMAND_INT. Return None for any other message."""
     number = getattr(message, "command", None)
     if number is None:
         return None

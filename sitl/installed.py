@@ -96,7 +96,7 @@ class InstalledVersion:
     @cached_property
     def damage(self) -> str | None:
         """A description of the first problem with the installed files, such as a change after the download. None if all
-        files are intact. The method reads all files.
+        files are intact. Each use of this property reads all files.
         """
         if self.manifest is None:
             return f"{MANIFEST} is missing or cannot be read"

@@ -108,7 +108,7 @@ def _step_through(
 
 def _in_use(in_use: ReplayResult, result: ReplayResult) -> list[Text]:
     """Return a warning if the installed agent core handles the recorded inputs differently from the reference.
-    Otherwise return None.
+    Otherwise return an empty list.
     """
     if [each.line for each in in_use.deviations] == [each.line for each in result.deviations]:
         return []

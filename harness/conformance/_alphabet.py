@@ -133,7 +133,7 @@ def _chain_hashes(model: ReferenceModel) -> list[bytes]:
 
 
 def _chain_below_top(model: ReferenceModel) -> bytes | None:
-    """Return the chain hash of the chain without its newest block."""
+    """Return the chain hash of the chain without its newest block. Return None if the chain contains no block."""
     hashes = _chain_hashes(model)
     return hashes[-2] if len(hashes) > 1 else None
 
@@ -144,7 +144,9 @@ def _top_block(model: ReferenceModel) -> Block | None:
 
 
 def _chain_with_popped_block(model: ReferenceModel) -> bytes | None:
-    """Return the hash of the chain that results when the most recently popped block is appended again."""
+    """Return the hash of the chain that results when the most recently popped block is appended again. Return None if
+    no block was popped.
+    """
     stack = model.state.reconcile_stack
     return next_chain_hash(_top(model), stack[-1].block_hash) if stack else None
 

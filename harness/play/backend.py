@@ -60,7 +60,7 @@ class Backend(ABC):
         """Return a context manager that starts the agents of a scenario. The agents write their files to `rundir`.
 
         `refuse` must have accepted the scenario. If an error ends the mission early, the context catches it and records
-        it in `played`. Raises HarnessError if the swarm cannot be opened.
+        it in `Swarm.played`. Raises HarnessError if the swarm cannot be opened.
 
         - `interrupted`: ends the mission early when it is set.
         - `interactive`: a user may cause faults that the scenario does not contain, so each agent has a disk.

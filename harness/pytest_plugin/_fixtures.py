@@ -92,8 +92,8 @@ def _marked(node: pytest.Item) -> tuple[Path, dict[str, Any]]:
 
 
 def _variant(marked: Any, node: pytest.Item, options: SessionOptions) -> Path | None:
-    """Return the file of the protocol variant. A command-line option takes precedence over the marker. Raises
-    ScenarioError.
+    """Return the file of the protocol variant, or None for the original protocol. A command-line option takes
+    precedence over the marker. Raises ScenarioError.
     """
     if marked is not None and not isinstance(marked, str | Path):
         raise ScenarioError(f"`variant` is {marked!r}: use the path of a Python file")

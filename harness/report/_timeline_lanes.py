@@ -174,7 +174,7 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine commits of the same agent that are close in time. At most about `MAX_COMMITS` marks remain."""
+    """Combine commits of the same agent that are close in time, until at most `MAX_COMMITS` marks remain."""
     groups = [[commit] for commit in commits]
     within_s = end_s / 4000
     while len(groups) > MAX_COMMITS:

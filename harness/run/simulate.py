@@ -222,8 +222,8 @@ def simulated(scenario: Scenario, seed: int) -> Result:
 
 
 def _judge_failures(failures: Sequence[AgentFailedError]) -> Judgement:
-    """Return the verdict on agents that crashed or hung. A crash in a handler does not count, because it already counts
-    as a deviation of this handler.
+    """Return the verdict on agents that crashed or hung. The caller omits crashes in handlers, because these already
+    count as deviations.
     """
     reason = "; ".join(f"agent {error.agent_id} {error.outcome}" for error in failures)
     findings = [Finding(error.agent_id, f"{error.outcome}: it {error.detail}") for error in failures]

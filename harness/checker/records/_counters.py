@@ -20,8 +20,8 @@ ROUNDED_S = 5e-4
 
 
 def compare_counters_of_run(evidence: Evidence) -> Iterator[Contradiction]:
-    """Yield each counter of an agent in run.json that differs from the number of matching lines in the agent's
-    trace.
+    """Yield each contradiction between the entry of an agent in run.json and the agent's trace or export. The compared
+    values are the counters, the flag `idle`, and the way in which the agent ended.
     """
     for agent_id, trace in evidence.traces.items():
         recorded = evidence.recorded(agent_id)

@@ -424,7 +424,7 @@ def reconcile_finalize(state: ReferenceState) -> str:
 
 def tally_of(state: ReferenceState, handler: Handler) -> Tally | None:
     """Return the counters of a handler: a copy of its votes or candidates, or the candidate that it chose. Hashes are
-    hexadecimal text.
+    hexadecimal text. Return None for a handler that counts nothing.
     """
     dictionary = state.reconcile_response_dictionary
     if handler.tally == "majority_response_block_hash":

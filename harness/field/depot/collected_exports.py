@@ -393,8 +393,8 @@ def _edited(path: Path, which: str, claimed: str) -> str:
 
 
 def _content(path: Path, named_by_user: bool) -> bytes:
-    """Return the content of a file. Return None if the file does not look like an export and the user did not name the
-    file itself.
+    """Return the content of a file. Raises NotAnExportError if the file does not look like an export and the user did
+    not name the file itself. Raises ExportError if the file cannot be read or is too large.
     """
     try:
         with BoundedFile(path, MAX_EXPORT_BYTES) as file:

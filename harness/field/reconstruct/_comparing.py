@@ -259,8 +259,8 @@ class SoloSimulations:
             )
 
     def _by_capture(self, header: CheckedHeader, by_trace: SoloSimulation | None) -> SoloSimulation | None:
-        """Return the simulation that explains more inputs: the given simulation with the trace, or a simulation with
-        the packet capture.
+        """Return the simulation that explains more inputs: the given simulation `by_trace`, or a simulation with the
+        packet capture. Return None if neither exists.
         """
         agent_id = header.agent_id
         export, capture = self._flight.exports.get(agent_id), self._other_records.captures.get(agent_id)

@@ -67,7 +67,9 @@ class ResumptionSearch:
         return True
 
     def _chain(self, top: str, predecessors: _ChainSteps) -> list[Block] | None:
-        """Return the blocks of the chain with this top chain hash. The oldest is first. Raises NotOnRecordError."""
+        """Return the blocks of the chain with this top chain hash, the oldest first. Return None if `predecessors` does
+        not contain the whole chain. Raises NotOnRecordError if the content of a block is unknown.
+        """
         blocks: list[Block] = []
         chain_hash = bytes.fromhex(top) if len(top) == 2 * HASH_BYTES and _is_hex(top) else b""
         while chain_hash != self._inception:

@@ -158,14 +158,16 @@ class VehicleProcess:
             (self._directory / PARAMETERS).write_text(in_lines(known), encoding="utf-8")
 
     async def get_ready(self) -> None:
-        """Prepare the vehicle until it can be armed. Raises VehicleFailedError if the vehicle was killed."""
+        """Prepare the vehicle until it can be armed. Raises VehicleFailedError if this fails. The process of the
+        vehicle has then ended.
+        """
         assert self.pilot is not None and self._flight is not None
         await self._introduce()
         await self._run_pilot(self.pilot.get_ready(self._flight))
 
     async def fly(self) -> None:
-        """Fly the vehicle, and then read its telemetry until the mission ends. Raises VehicleFailedError if the vehicle
-        was killed.
+        """Fly the vehicle, and then read its telemetry until the mission ends. Raises VehicleFailedError if the flight
+        fails. The process of the vehicle has then ended.
         """
         assert self.pilot is not None and self._flight is not None
         await self._introduce()

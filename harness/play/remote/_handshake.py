@@ -119,7 +119,9 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
 
 
 def _shared(exchange: KeyExchange, words: dict[str, Any]) -> bytes | None:
-    """Return the result of the key exchange, and remove the public key from `words`. Raises HandshakeError."""
+    """Return the secret that both ends compute by the key exchange. Return None if an end lacks the package
+    cryptography. Remove the public key from `words`. Raises HandshakeError if the public key is invalid.
+    """
     try:
         return exchange.shared(words.pop("share", None))
     except ValueError:

@@ -400,7 +400,7 @@ class StandIn:
         writer.close()
 
     async def _handle(self, line: bytes) -> bytes:
-        """Return the answer to a request. Return an empty text if the agent closed its control socket."""
+        """Return the answer to a request. The answer is empty if the agent closed its control socket."""
         try:
             request = parse_json(line)
         except ValueError:

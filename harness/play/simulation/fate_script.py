@@ -222,8 +222,8 @@ class LateTimers:
         return self._started > max(late, default=-1) and running.isdisjoint(late)
 
     def next(self, at: Callable[[float], float]) -> tuple[float, RunningTimer] | None:
-        """Return the mission second of the next timer expiry, and the timer. `at` converts a time on the agent's clock
-        to mission seconds.
+        """Return the mission second of the next timer expiry, and the timer. Return None if no timer runs. `at`
+        converts a time on the agent's clock to mission seconds.
         """
         ends = ((at(timer.deadline) + self._late_by_s.get(timer.number, 0.0), timer) for timer in self.running.values())
         return min(ends, default=None, key=lambda end: (end[0], end[1].deadline))

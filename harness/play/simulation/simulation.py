@@ -479,7 +479,7 @@ class Simulation(EventLoop):
 
     def _handler_runs(self, incarnation: SimulatedIncarnation, status: AgentStatus | None) -> HandlerRuns | None:
         """Return the number of handler runs of the agent, with the time of the count. A foreign agent counts its
-        handler runs itself.
+        handler runs itself. Return None if its status is unknown.
         """
         if status is None:
             return None

@@ -150,7 +150,8 @@ class KnownStates:
         """Return new IDs for the other agents that put these senders first, in their order. Return None if no change is
         needed.
 
-        Also return None if the agent's vote counts already distinguish other agents.
+        Also return None if the IDs must not change: the agent's vote counts distinguish other agents, the state has a
+        flaw, or states are stored with agent IDs.
         """
         known = self.known[local]
         if not self._nameless or known.names_others or known.flaw is not None:

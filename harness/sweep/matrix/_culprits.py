@@ -121,7 +121,9 @@ class _CulpritSearch:
         return step.first[0]
 
     def _figure(self, commit: str) -> float | None:
-        """Return the numeric result that the run has with the code of this commit."""
+        """Return the numeric result that the run has with the code of this commit. Return None if the result is
+        unknown. Raises UntestableError if an agent crashes.
+        """
         if commit not in self._figures:
             if time.monotonic() > self._deadline:
                 raise _TimeIsUpError

@@ -227,8 +227,9 @@ def _say_culprit(culprit: Culprit) -> Iterable[str]:
 
 
 def _first_changes(changed: ChangedRuns) -> str:
-    """Find the first changed handler run of each run. Return the names of their handlers, and the run whose change is
-    the earliest."""
+    """Return a phrase about the first changed handler run of each run: the names of the handlers, and the run whose
+    change is the earliest. Return an empty text if no handler is known.
+    """
     known = [each for each in changed.first if each.handler is not None]
     if not known:
         return ""

@@ -95,7 +95,7 @@ class Browser:
         self._call("Emulation.setEmulatedMedia", media="")
 
     def screenshot(self, path: Path) -> None:
-        """Return a picture of the whole page."""
+        """Write a picture of the whole page to `path`."""
         shot = self._call("Page.captureScreenshot", captureBeyondViewport=True)
         path.write_bytes(b64decode(shot["data"]))
 

@@ -92,7 +92,7 @@ class _McapReader:
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
         """Return the position of the next undamaged record. A record counts as undamaged if another record or the end
-        of the buffer follows it.
+        of the buffer follows it. Return None if no such record is found.
         """
         for match in _BEGINNING.finditer(buffer, start):
             if next(self._tries, None) is None:

@@ -80,7 +80,7 @@ class _BagVersion1Reader:
         self._topics.known.setdefault(fields.get("conn", b""), topic_and_type)
 
     def _next(self, buffer: Buffer, start: int) -> int | None:
-        """Return the position of the next undamaged record."""
+        """Return the position of the next undamaged record. Return None if no such record is found."""
         for match in _OPERATION.finditer(buffer, start):
             for candidate in range(match.start() - _U32.size, max(start, match.start() - _HEAD_BEFORE) - 1, -1):
                 if next(self._tries, None) is None:

@@ -254,8 +254,9 @@ class Hunt:
         return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> KeptRun:
-        """Choose a stored document at random. In half of all cases, choose one of the newest documents. In the other
-        cases, prefer documents with a high expected benefit.
+        """Choose a stored document at random. In half of all cases, choose one of the newest documents. A share
+        `NEAR_LIVELOCK` of the other cases chooses a document with a new pattern of failed votes, if there is one. The
+        remaining cases prefer documents with a high expected benefit.
 
         `worth` contains cumulative sums of the expected benefits.
         """

@@ -49,7 +49,9 @@ class CellRuns:
 
 
 def drilldown(finished: Finished, directory: Path) -> list[CellRuns]:
-    """Return the runs of all summaries. `directory` is the directory of the page. Links are relative to it."""
+    """Return the runs of each cell, with failed and bad runs first. `directory` is the directory of the page. Links are
+    relative to it.
+    """
     by_point = [(point, list(runs)) for point, runs in groupby(finished.runs, key=lambda run: run.point)]
     room = MAX_ROWS // max(1, len(by_point))
     cells = []
