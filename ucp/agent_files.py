@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 CHUNK_BYTES = 64 * 1024
 RESERVED_BYTES = 1024 * 1024
-"""Disk space reserved for the chain export. It is enough for about 700 blocks."""
+"""Number of bytes of disk space reserved for the chain export. They are enough for about 700 blocks."""
 KEPT_FREE_SHARE = 0.1
 """Share of the file system that traces and logs leave free for stores and chain exports."""
 MAX_KEPT_FREE_BYTES = 16 * 1024 * 1024

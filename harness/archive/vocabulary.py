@@ -151,9 +151,8 @@ def has_unknown_kind(trigger: UnknownTrigger) -> bool:
 
 
 def timer_that_ended(run: HandlerRun, trigger: TimerTrigger) -> str:
-    """Return the name of the timer that triggered the handler run.
-
-    If the name is unknown, return the timer whose expiry triggers the handler of this run, or None.
+    """Return the name of the timer that triggered the handler run. If the name in the trace is unknown, return the name
+    of the timer whose expiry triggers this handler. If no timer triggers this handler, return the unknown name.
     """
     name = trigger.timer
     return name if name in TIMERS else TIMER_OF.get(run.handler, name)

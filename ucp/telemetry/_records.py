@@ -21,7 +21,7 @@ EVENT_KINDS: dict[EventKind, tuple[int, ...]] = {
 """Event IDs by kind of event."""
 
 MAX_DATA_BYTES = 256
-"""Maximum length of event data. Longer data is truncated."""
+"""Maximum number of bytes of event data. Longer data is truncated."""
 
 UNKNOWN_MODE = 0xFFFFFFFF
 UNKNOWN_HEADING = UNKNOWN_VOLTAGE = 0xFFFF

@@ -362,8 +362,8 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
 def _compare(
     script: PeerScript, received: list[tuple[float, Message]], slack_s: float
 ) -> Iterator[tuple[float, RecordDifference]]:
-    """Yield each message that is missing, different or unexpected, with its mission second. Messages about the end of a
-    reconcile are not compared, because an agent does not answer during a reconcile.
+    """Yield each message that is missing, different or unexpected, with its mission second. Near the end of a
+    reconcile, missing and unexpected messages are not reported, because an agent does not answer during a reconcile.
     """
     unmatched = list(received)
     for expected_message in script.expected:
