@@ -179,8 +179,8 @@ class Pilot:
                 continue
 
     def _is_over(self, procedure: PilotProcedure) -> bool:
-        """Return true if the procedure need not continue, because the flight was ended or another pilot flies the
-        vehicle.
+        """Return true if the procedure need not continue. This is so if the flight was ended, if another pilot flies
+        the vehicle, or if the vehicle has left its mode because of a simulated failure.
         """
         if isinstance(procedure, FlightTermination):
             return False

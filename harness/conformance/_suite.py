@@ -369,8 +369,8 @@ class VectorSuite:
         return TOO_LATE
 
     async def play(self, variant: SettingsVariant, path: Sequence[str]) -> ReplayOutcome:
-        """Give these inputs to a new agent. Return the first failure of the agent. Return RIGHT if the agent made no
-        error, or TOO_LATE if the machine was late.
+        """Give these inputs to a new agent. Return the first failure of the agent, or RIGHT if the agent made no error.
+        Return TOO_LATE if the machine was late, or if the agent could not be started.
         """
         try:
             agent = await self._start(variant, True)

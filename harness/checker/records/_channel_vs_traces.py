@@ -18,7 +18,7 @@ from ucp.trigger import MessageTrigger
 
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each count in run.json that the channel's log contradicts. Also yield each agent that handled a message
-    although the channel had lost this message.
+    that the channel lost or never carried.
     """
     record, lines = evidence.record, evidence.channel
     if record is None or record.channel is None or not lines:

@@ -88,7 +88,7 @@ def in_one_line(label: str) -> str:
 
 
 def size_row(cell: Cell) -> list[str]:
-    """Return the means of a summary, in the order of `SIZE_METRICS`."""
+    """Return the means of a cell, in the order of `SIZE_METRICS`."""
     share = Metric("finished", "", lambda _: None, "share of runs")
     return [
         say(share, cell.finished)
@@ -129,7 +129,7 @@ def render(record: MatrixRecord) -> Iterator[RenderableType]:
 
 
 def place(record: MatrixRecord, cell: Cell) -> list[str]:
-    """Return the mission length in seconds and the number of agents of a summary, as text."""
+    """Return the mission length in seconds and the number of agents of a cell, as text."""
     return [f"{record.matrix.scenario_at(cell.point).duration_s:g}", str(cell.agents)]
 
 

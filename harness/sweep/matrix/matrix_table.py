@@ -150,7 +150,7 @@ def violated(cell: Cell) -> int:
 
 
 def troubles(record: MatrixRecord, cell: Cell) -> Iterable[str]:
-    """Yield a sentence for each failure, bad verdict, unfinished run or worsened numeric result of a summary."""
+    """Yield a sentence for each failure, bad verdict, unfinished run and worsened numeric result of a cell."""
     by_words = {BAD_IN_WORDS[key]: seeds for key, seeds in cell.violated.items()}
     for trouble, seeds in {**by_words, "more time needed": cell.unfinished}.items():
         if seeds:

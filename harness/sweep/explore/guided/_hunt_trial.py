@@ -66,7 +66,7 @@ class FindingIdentity:
 
 def identities(result: Result, cycle: Cycle | None, scenario: Scenario) -> tuple[FindingIdentity, ...]:
     """Return the identity of the finding for each bad verdict. An identity also contains the settings that differ from
-    the thesis.
+    the thesis. If the run has an endless cycle, the verdicts in `CAUSED_BY_LIVELOCK` are no separate findings.
     """
     settings = _changed_settings(scenario.settings)
     return tuple(

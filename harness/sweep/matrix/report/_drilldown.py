@@ -1,4 +1,4 @@
-"""List the runs of each summary, with failed runs first and a command that plays one of the runs again."""
+"""List the runs of each cell, with failed runs first and a command that plays one of the runs again."""
 
 import shlex
 from collections.abc import Sequence
