@@ -190,18 +190,18 @@ class WorkerConnection:
             case Kind.PONG:
                 pass
             case Kind.READY:
-                self._program(message.document()["program"]).started.set_result(None)
+                self._ready(self._program(message.document(program=int)["program"]))
             case Kind.LOG:
                 with contextlib.suppress(OSError), self._program(number).output.open("ab") as file:
                     file.write(message.payload[NUMBER_BYTES:])
             case Kind.FILE:
                 self._write_file(self._program(number).output.parent, message.payload[NUMBER_BYTES:])
             case Kind.EXIT:
-                self._exit(message.document())
+                self._exit(message.document(program=int))
             case Kind.ANSWER:
-                answer = message.document()
+                answer = message.document(stream=int)
                 if (waiting := self._answers.get(answer["stream"])) is not None and not waiting.done():
-                    waiting.set_result(answer["error"])
+                    waiting.set_result(answer.get("error"))
             case Kind.STREAM:
                 if (writer := self._streams.get(number)) is not None:
                     data = message.payload[NUMBER_BYTES:]
@@ -213,6 +213,11 @@ class WorkerConnection:
             case _:
                 raise WireError(f"a message {message.kind.name} arrived at the wrong time")
 
+    def _ready(self, program: FarVehicle) -> None:
+        if program.started.done():
+            raise WireError("a vehicle program has started twice")
+        program.started.set_result(None)
+
     def _program(self, number: object) -> FarVehicle:
         """Return a program that the worker names. Raises WireError if it does not exist."""
         program = self._programs.get(number) if isinstance(number, int) else None
@@ -221,6 +226,8 @@ class WorkerConnection:
         return program
 
     def _write_file(self, directory: Path, payload: bytes) -> None:
+        if len(payload) < FILE_HEADER.size:
+            raise WireError("a message FILE is too short")
         (length,) = FILE_HEADER.unpack_from(payload)
         name, data = payload[FILE_HEADER.size : FILE_HEADER.size + length], payload[FILE_HEADER.size + length :]
         try:
@@ -235,5 +242,6 @@ class WorkerConnection:
         program = self._program(how["program"])
         if not program.started.done():
             program.started.set_result(str(how.get("error")))
-        program.finish(int(how.get("status", -signal.SIGKILL)))
+        status = how.get("status")
+        program.finish(status if isinstance(status, int) else -signal.SIGKILL)
         del self._programs[program.number]

@@ -65,14 +65,19 @@ class Message:
     kind: Kind
     payload: bytes
 
-    def document(self) -> dict[str, Any]:
-        """Return the JSON object in the message. Raises WireError."""
+    def document(self, **types: type) -> dict[str, Any]:
+        """Return the JSON object in the message. `types` maps keys that the object must have to the types of their
+        values. Raises WireError.
+        """
         try:
             value = parse_json(self.payload)
         except ValueError:
             value = None
         if not isinstance(value, dict):
             raise WireError(f"a message {self.kind.name} is not a JSON object")
+        for key, expected in types.items():
+            if not isinstance(value.get(key), expected):
+                raise WireError(f"a message {self.kind.name} has no {key!r} of the type {expected.__name__}")
         return value
 
 

@@ -213,7 +213,7 @@ class StandIn:
             case Kind.BUNDLE if self._bundle is not None:
                 _write_bundle(self._bundle, message.document())
             case Kind.EXIT:
-                self._exit(message.document())
+                self._exit(message)
             case _:
                 raise WireError(f"a message {message.kind.name} arrived at the wrong time")
 
@@ -503,16 +503,17 @@ class StandIn:
         self._send_signal(signal.SIGKILL)
         self._loop.call_later(KILL_LIMIT_S, self._end, -signal.SIGKILL)
 
-    def _exit(self, how: dict[str, Any]) -> None:
-        if how.get("gone"):
+    def _exit(self, message: Message) -> None:
+        if message.document().get("gone"):
             self._tell({"gone": True})
             self._end(FAILED, "the far computer has started anew, and the agent of this incarnation is gone")
             return
+        how = message.document(datagrams=int, left_behind=list, status=int)
         if self._connection is not None:
             self._connection.send(Kind.IDLE)  # the far end may end
-        self._lost = int(how["datagrams"]) - self._released
+        self._lost = how["datagrams"] - self._released
         self._tell({"left_behind": how["left_behind"]})
-        self._end(int(how["status"]))
+        self._end(how["status"])
 
 
 def _write_bundle(path: Path, document: dict[str, Any]) -> None:
