@@ -174,17 +174,19 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine commits of the same agent that are close in time, until at most `MAX_COMMITS` marks remain."""
+    """Combine commits of the same agent that are close in time, until at most `MAX_COMMITS` marks remain. If there are
+    more agents than that, combine all consecutive commits of an agent.
+    """
     groups = [[commit] for commit in commits]
-    within_s = end_s / 4000
-    while len(groups) > MAX_COMMITS:
+    for within_s in (end_s / parts for parts in (4096, 2048, 1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)):
+        if len(groups) <= MAX_COMMITS:
+            break
         groups = []
         for commit in commits:
             if groups and groups[-1][0].agent == commit.agent and commit.at_s - groups[-1][0].at_s <= within_s:
                 groups[-1].append(commit)
             else:
                 groups.append([commit])
-        within_s *= 2
     return groups
 
 

@@ -79,9 +79,11 @@ class CoverageShare:
 
     @property
     def percent(self) -> str:
-        """The share as text, for example "35 %". Rounding never gives 0 % or 100 %."""
+        """The share as text, for example "35 %". Only exact shares are printed as 0 % or 100 %."""
         if self.reached == self.exist:
             return "100 %"
+        if self.reached == 0:
+            return "0 %"
         share = 100 * self.reached / self.exist
         return f"{min(max(share, 0.1), 99.9):.1f} %" if share < 1 or share > 99 else f"{share:.0f} %"
 

@@ -149,6 +149,9 @@ def test_long_run_with_many_changes_is_thinned_and_reported() -> None:
     assert len(groups) <= _timeline_lanes.MAX_COMMITS
     assert sum(map(len, groups)) == len(commits), "no commit is lost, only drawn together"
     assert all(len({commit.agent for commit in group}) == 1 for group in groups)
+    agents = range(_timeline_lanes.MAX_COMMITS + 1)
+    many = [BlockCommit(agent, at_s, "a", "vote") for agent in agents for at_s in (1.0, 200.0)]
+    assert len(_timeline_lanes.group_commits(many, 200.0)) == len(agents), "one mark for each agent"
 
 
 def test_charts_are_thinned_but_keep_the_worst_moments() -> None:

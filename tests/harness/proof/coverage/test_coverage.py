@@ -11,6 +11,7 @@ from harness.archive.archive import RunArchive
 from harness.checker import gather
 from harness.proof import Bounds
 from harness.proof.coverage import ReachedStates, existing, in_words, reached_in, to_json
+from harness.proof.coverage._share import CoverageShare
 from harness.proof.coverage.reached import BRANCHES
 from harness.proof.model._shape import LEFT_OUT
 from harness.proof.model._snapshot import LEFT_OUT as OF_SNAPSHOTS
@@ -52,6 +53,13 @@ def by_chance(agents: int, blocks: int, seed: int) -> Scenario:
 
 def reached(asked: Scenario, seed: int = 1, **options: Any) -> ReachedStates:
     return reached_in(simulate(asked, seed, tracing=True, deliver_all=True, **options).evidence)
+
+
+@pytest.mark.parametrize(
+    ("reached", "percent"), [(0, "0 %"), (1, "0.1 %"), (3_500, "35 %"), (9_999, "99.9 %"), (10_000, "100 %")]
+)
+def test_only_exact_shares_are_printed_as_none_or_all(reached: int, percent: str) -> None:
+    assert CoverageShare(reached, 10_000, 0).percent == percent
 
 
 def test_shape_covers_each_attribute_or_omits_it_with_a_reason() -> None:
