@@ -5,7 +5,8 @@ with the mark still runs after its agent has ended, the agent left it behind, an
 identifies children that left the session of the agent. A child that cleared its environment is not found. Such a child
 ends together with the lab.
 
-In a container, the kernel ends the children. `harness.play.containers._container_processes` finds their names.
+In a container, the kernel ends the children. `harness.play.containers._container_processes` finds the names of these
+children.
 """
 
 import os

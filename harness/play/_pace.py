@@ -34,8 +34,8 @@ class VirtualTimePace:
         self._now_s = 0.0
         self._limited = True
         self._anchor: tuple[float, float] | None = None
-        """A wall time and the mission second that belongs to it. Later mission seconds follow from this pair and the
-        current speed. None if the next check must set the pair.
+        """A pair of a wall time and the corresponding mission second. The object computes later mission seconds from
+        this pair and the current speed. None if the next check must set the pair.
         """
         self._pace_changed = asyncio.Event()
 
@@ -60,7 +60,8 @@ class VirtualTimePace:
 
     def step(self, to_s: float, done: "Future[float]") -> None:
         """Advance virtual time to mission second `to_s`, and then pause. With `NEXT_RUN`, advance to the next handler
-        run. The future `done` receives the mission second at the end of the step. It must be in the state "running".
+        run. The future `done` receives the mission second at the end of the step. The caller must pass the future in
+        the state "running".
         """
         self.paused = True
         self._change()

@@ -35,8 +35,8 @@ class RadioRange:
         self._cut_off: frozenset[int] = frozenset()
 
     def change_timeline(self, change: NetworkChange) -> NetworkChange:
-        """Return the change of the network that a timeline entry causes, combined with the radio losses at the current
-        positions of the vehicles.
+        """Return the change of the network that a timeline entry causes. The new conditions include the radio losses at
+        the current positions of the vehicles.
         """
         self._requested = change.conditions
         if change.clears_all:

@@ -15,8 +15,8 @@ from netem.channel import Channel, EndedTransmission, FrameFate, Radio, numbers
 from netem.radio import Place
 
 Journal = Callable[[dict[str, object]], None]
-"""A function that records a message on the channel. The record contains the time at which the agent gave the message to
-its radio, the time at which the radio sent it, and the vehicles that lost it.
+"""A function that records a message on the channel. The record contains the time at which the agent passed the message
+to its radio, the time at which the radio sent the message, and the vehicles at which it was lost.
 """
 
 NEVER = float("inf")
@@ -38,7 +38,7 @@ Message = TypeVar("Message", bound=_SentFrame)
 
 
 class ChannelTraffic(Generic[Message]):
-    """The messages on a radio channel that all agents share. A message waits for the channel, or is in transmission."""
+    """The messages that wait for a shared radio channel, or that are in transmission on it."""
 
     def __init__(
         self, roster: Sequence[int], radio: Radio, processing_s: float, seed: int, journal: Journal | None
@@ -110,8 +110,8 @@ class ChannelTraffic(Generic[Message]):
 
 
 class ChannelTotals:
-    """Counts of a shared channel: sent frames, lost frames by receiver, dropped messages by sender, and its load over
-    time.
+    """Counts of a shared channel: sent frames, lost frames of each receiver, dropped messages of each sender, and the
+    load of the channel over time.
     """
 
     def __init__(self, roster: Sequence[int]) -> None:

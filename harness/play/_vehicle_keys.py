@@ -41,7 +41,8 @@ class MissionKeys:
 
     def add_depot_key(self, initial_data: bytes) -> bytes:
         """Return the data of the inception block, the first block of each chain. If event data are encrypted, append
-        the public key for the encryption. The depot, which collects the records after the flight, has the private key.
+        the depot's public key, with which agents encrypt these data. The depot collects the records after the flight,
+        and decrypts them with its private key.
         """
         return seal_to(initial_data, self.public.depot) if self.seals and self.public.depot else initial_data
 

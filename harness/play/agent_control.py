@@ -207,6 +207,6 @@ class AgentControl:
 
 
 async def connect(socket_path: Path) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
-    """Connect to the control socket of an agent, which sends each answer as one line. Raises OSError."""
+    """Connect to the control socket of an agent. The agent sends each answer as one line. Raises OSError."""
     with short_name(socket_path.parent) as directory:
         return await asyncio.open_unix_connection(f"{directory}/{socket_path.name}", limit=ANSWER_LIMIT_BYTES)

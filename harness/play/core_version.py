@@ -1,7 +1,7 @@
 """Find out whether the agent core in use is the released core or was edited.
 
 The core is the code of `ucp` that determines how an agent behaves. An engineer who develops the protocol edits this
-code in place. The difference has two effects. First, a run records which core its agents had. Second, virtual time
+code in place. An edited core has two effects. First, a run records which core its agents had. Second, virtual time
 omits messages that the released core would ignore (`ucp.interest`). With an edited core, it delivers them, because an
 edited core might not ignore them.
 

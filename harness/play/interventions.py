@@ -4,7 +4,7 @@ of the run.
 `harness.run.run.run` takes an `Interventions` object. Any thread may then use it:
 
     interventions = Interventions(scenario, virtual_time=True, factor=20.0)
-    interventions.ask({"partition": [[1, 2], [3, 4, 5]]}).result()      # -> 312.472, the mission second of it
+    interventions.ask({"partition": [[1, 2], [3, 4, 5]]}).result()      # -> 312.472, the mission second of the event
     interventions.ask({"reboot": [3], "down_s": 30, "disk": "kept"})
     interventions.pause().result(), interventions.step(10.0), interventions.resume(), interventions.set_factor(None)
 
@@ -74,7 +74,7 @@ class GrowingTimeline:
         await swarm.until(mission_s)
 
     def with_origin(self, change: Change) -> Change:
-        """Return the change. If a user requested the change, add the mark `by_hand`."""
+        """Return the change. If a user requested it, the returned change has the mark `by_hand`."""
         return change
 
 
@@ -340,8 +340,8 @@ class Interventions(GrowingTimeline):
                 timeline[number]["for_s"] = round(entry.at_s - earlier.at_s, 6)
 
     def _refuse_unprepared(self, entry: TimelineEntry) -> None:
-        """Raise ScenarioError if the entry needs a preparation of the agents at the start of the run, which did not
-        take place. Also raise ScenarioError for a revocation that this machine cannot sign.
+        """Raise ScenarioError if the entry is possible only in a run that was prepared for it at the start. Also raise
+        ScenarioError for a revocation that this machine cannot sign.
         """
         if entry.fault is not None and entry.fault.needs_keys:
             refuse_revocations(self.scenario)

@@ -1,7 +1,8 @@
 """Carry out a mission with any backend.
 
-The class `Swarm` is the interface of a backend. A mission applies the timeline, stops the events, and waits until the
-agents are idle. If the scenario asks for a final reconcile, the mission ends with it.
+The class `Swarm` is the interface of a backend. During a mission, the harness applies the timeline. It then stops the
+logging of events, and waits until the agents are idle. If the scenario asks for a final reconcile, the mission ends
+with this reconcile.
 """
 
 from collections.abc import Awaitable, Callable, Mapping
@@ -37,7 +38,7 @@ Outcome = Literal["completed", "interrupted", "failed", "not supported"]
 
 @dataclass
 class RunOutcome:
-    """The result of a scenario after its mission, before the checker judges it."""
+    """The result of a mission, before the checker judges this result."""
 
     outcome: Outcome = "completed"
     outcome_detail: str | None = None

@@ -33,7 +33,7 @@ SOCKET = "by-hand"
 MAX_REQUEST_BYTES = 64 * 1024
 MAX_CONNECTIONS = 32
 FINAL_ANSWERS_S = 0.1
-"""Maximum wall time in seconds that the last answers take at the end of the run."""
+"""Maximum seconds of wall time for which the run waits at its end to send the last answers."""
 
 
 @asynccontextmanager

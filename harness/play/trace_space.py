@@ -6,7 +6,7 @@ agents, or faster. A trace ends at its quota in the same way as on a full disk: 
 in `run.json`. Without a quota, the traces would leave no space for exports, verdict and report.
 
 The quota counts the lines of a trace before they are packed, because a busy machine packs them late. The kernel
-enforces it as the maximum size of a file.
+enforces the quota as the maximum size of a file.
 """
 
 import math
@@ -73,7 +73,7 @@ def space_sentence(scenario: Scenario, directory: Path, *, all_delivered: bool) 
 
 
 def _source(scenario: Scenario, quota: int) -> str:
-    """Return the reason why the quota of all traces together has this size, as the phrase of a message."""
+    """Return a phrase that explains why all traces together have this quota."""
     if quota == LEAST_BYTES_PER_AGENT * len(scenario.roster):
         return "the least for each agent"
     if quota == MAX_TRACE_BYTES * len(scenario.roster):

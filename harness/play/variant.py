@@ -1,7 +1,7 @@
 """Load protocol variants. A variant is a Python file in which a user changes algorithms of the protocol.
 
-A variant changes some of Algorithms 1 to 20. For each changed algorithm the file holds two transcriptions: the handler
-of the agents, and the function of the reference that judges them.
+A variant changes some of Algorithms 1 to 20. For each changed algorithm, the file contains two implementations: the
+handler that the agents use, and the function of the reference that judges the agents.
 
     '''Approve a tied vote.'''
 
@@ -44,8 +44,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list the abilities
-    that the original handler lacks, such as further messages to send.
+    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list possible
+    actions of the new handler that the original handler lacks, such as further messages that it sends.
     """
 
     algorithm: int

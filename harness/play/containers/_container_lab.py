@@ -70,7 +70,8 @@ class ContainerLab:
 
     @classmethod
     async def open(cls, scenario: Scenario, rundir: RunDirectory, say: Callable[[str], None]) -> "ContainerLab":
-        """Start the network, with an idle container for each vehicle that keeps its network namespace.
+        """Start the network. For each vehicle, start an idle container, which keeps the network namespace of the
+        vehicle.
 
         Raises DockerError, and the errors of netem.lab.Lab.open.
         """
@@ -170,7 +171,7 @@ class ContainerLab:
         """Start a program in its own container, in the network of a vehicle.
 
         `max_file_bytes` limits the size of files that the program writes. The limit applies only to programs in an
-        image of the harness. At the limit, the kernel sends a signal, which might end other programs.
+        image of the harness. Other programs might not handle the signal that the kernel sends at the limit.
         """
         holder = next(identity for identity, held in self._holders.items() if held == vehicle)
         image = self._named if role == "agent" and vehicle in self._in_named else self._ours

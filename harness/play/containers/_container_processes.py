@@ -1,5 +1,5 @@
-"""Find the processes of a container from outside. End the program of a container in such a way that the remaining
-processes are visible.
+"""List the processes of a container from outside, and end the program of a container. After the end of the program, the
+harness can still list the processes that the program left behind.
 
 The first process of a container, docker-init, ends together with its program. The kernel then kills all other processes
 of the container, before any other process could list them. Therefore the harness suspends docker-init while it ends the
@@ -35,9 +35,9 @@ def end_program(init: int, grace_s: float) -> list[str]:
     """End the program that `init`, the first process of a container, started. Return the names of the processes that
     the program left behind.
 
-    The program gets SIGTERM, and SIGKILL after `grace_s` seconds of wall time. If it needed SIGKILL, the list is empty,
-    because a killed program cannot end its own processes. The container ends when this function returns. Raises OSError
-    if the processes belong to another user or have ended.
+    The program gets SIGTERM, and SIGKILL after `grace_s` seconds of wall time. If SIGKILL was necessary, the list is
+    empty, because a killed program cannot end its own processes. The container ends when this function returns. Raises
+    OSError if the processes belong to another user or have ended.
     """
     with _suspended(init):
         program = int((PROC / f"{init}/task/{init}/children").read_text().split()[0])

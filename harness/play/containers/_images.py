@@ -83,7 +83,9 @@ def host_image() -> ContainerImage:
 
 
 def is_shared(program: Path) -> bool:
-    """Return true if containers with this machine's programs share the directory of this program."""
+    """Return true if this program also exists in containers that use the programs of this machine, because they share
+    its directory.
+    """
     mounted = host_image().mounted
     return all(any(path.is_relative_to(outer) for outer in mounted) for path in (program, program.resolve()))
 
@@ -177,8 +179,8 @@ def _tar(files: Mapping[str, bytes]) -> bytes:
 
 
 def _with_environment(program: Path) -> Path:
-    """Return the path that a container must share to run the program: the virtual environment of the program, or the
-    program itself if it belongs to none.
+    """Return the path that a container must share to run the program. This is the virtual environment of the program.
+    If the program belongs to no virtual environment, it is the program itself.
     """
     environment = program.parent.parent
     return environment if (environment / "pyvenv.cfg").is_file() else program

@@ -1,8 +1,8 @@
 """Give each agent in a container its own folder, so that the agent can neither read nor change files of other agents.
 
-All agents of a run have their files in one directory, `agents/`. In the container of agent 7, `agents/7-1/` is mounted
-in its place. During the run, links in `agents/` point to the files of the agents. At the end, the files replace the
-links.
+All agents of a run have their files in one directory, `agents/`. In the container of agent 7, Docker mounts
+`agents/7-1/` at the path of `agents/`. During the run, links in `agents/` point to the files of the agents. At the end,
+the files replace the links.
 """
 
 import contextlib

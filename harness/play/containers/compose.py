@@ -1,8 +1,7 @@
-"""Write a Docker Compose file with the vehicles and agents of a scenario, so that a user can start them by hand.
-
-The file needs no harness. A directory beside it holds the mission files and the build context of the image. Docker
-builds the network, so the swarm has no network conditions and no faults. Otherwise the containers equal those of the
-backend.
+"""Write a Docker Compose file with the vehicles and agents of a scenario, so that a user can start them by hand,
+without the harness. A directory beside the file contains the mission files and the build context of the image. Docker
+builds the network, so the swarm has no network conditions and no faults. In all other respects, the containers equal
+those of the Docker backend.
 """
 
 import os
@@ -82,8 +81,8 @@ def write_compose(
 
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
-    """Return the mission keys from the user's key directory, without moving the key files. Return None for a mission
-    without keys.
+    """Return the mission keys from the user's key directory. Return None for a mission without keys. Raises
+    ScenarioError if the scenario names no such directory, because the compose file contains no keys.
     """
     if scenario.security is None:
         return None

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 BACKLOG = 512
 WATCH_EVERY_S = 0.5
 END_LIMIT_S = 10.0
-"""Wall seconds after the run in which the workers must end their tasks."""
+"""Maximum seconds of wall time between the end of the run and the ends of the workers' tasks."""
 
 
 class AgentHosts:
@@ -102,14 +102,16 @@ class AgentHosts:
     # The connections of the workers
 
     def refusal(self, worker: str) -> str:
-        """Return the sentence with which the run refuses the connection of a worker, or an empty text."""
+        """Return the sentence with which the run refuses the connection of a worker. Return an empty text if the run
+        accepts the connection.
+        """
         if (connection := self._connections.get(worker)) is None:
             return f"this run has no worker {worker}"
         return "the worker has begun in another process, and its data are lost with it" if connection.done() else ""
 
     async def receive(self, far_end: FarEnd, record_lag: Callable[[str, bytes], None]) -> None:
-        """Accept the connection of a worker. The function `record_lag` gets the ID of the worker's first agent, and a
-        line with a measurement of the worker's delays. Raises OSError.
+        """Accept the connection of a worker. The function `record_lag` is called with the ID of the worker's first
+        agent, and with a line that contains a measurement of the worker's delays. Raises OSError.
         """
         worker = far_end.session
         first = str(self._placed[worker][0])
@@ -155,7 +157,9 @@ class AgentHosts:
         return await self._connection_of(vehicle).connect(self._vehicles[vehicle], port, timeout_s)
 
     def lost_worker(self, vehicle: int) -> str | None:
-        """Return the address of the worker of a vehicle if the worker is lost. Otherwise return None."""
+        """Return None if the worker that runs the vehicle is connected. Return the address of the worker if the worker
+        is lost.
+        """
         connection = self._connection_of(vehicle)
         return connection.worker if connection.is_lost else None
 

@@ -50,13 +50,15 @@ class Nursery:
     async def start_agent(
         self, vehicle: int, inside: socket.socket, directory: Path, command: Sequence[str]
     ) -> ForkedProcess:
-        """Start `harness.play.remote.far_worker` in the network of a vehicle. `inside` is the socket with which it
-        communicates with this process.
+        """Start `harness.play.remote.far_worker` in the network of a vehicle. `inside` is the socket with which the
+        started program communicates with this process.
         """
         return self._start(vehicle, inside, [str(directory), *command])
 
     def start_vehicle(self, vehicle: int, inside: socket.socket) -> ForkedProcess:
-        """Start `harness.play.hosts._vehicle_keeper` in the network of a vehicle. `inside` is its socket."""
+        """Start `harness.play.hosts._vehicle_keeper` in the network of a vehicle. `inside` is the socket with which the
+        started program communicates with this process.
+        """
         return self._start(vehicle, inside, None)
 
     def _start(self, vehicle: int, inside: socket.socket, agent: list[str] | None) -> ForkedProcess:
@@ -100,7 +102,7 @@ def _remove_ended_children() -> None:
 
 
 def _play(inside: int, order: dict[str, Any], network: int) -> None:
-    """Run one incarnation of an agent or of a vehicle, as the first process in the network."""
+    """Run one incarnation of an agent or of a vehicle program, as the first process in the vehicle's network."""
     os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)
     far_network.become_first_process(network)

@@ -1,4 +1,6 @@
-"""The names of the files that a vehicle program wrote, as they travel from a worker to the lab."""
+"""Convert between the paths of files that a vehicle program wrote, and the names with which a worker sends these files
+to the lab.
+"""
 
 import os
 import struct

@@ -45,8 +45,8 @@ MAX_ANSWER_BYTES = 1024
 READ_BYTES = 1 << 16
 FILE_BYTES = 1 << 18
 MAX_UNSENT_BYTES = 1 << 20
-"""Number of bytes waiting to be sent to the lab. Above this number, the program reads no further output of vehicles and
-no further files.
+"""Number of bytes waiting to be sent to the lab. Above this number, the worker reads no further output and no further
+files of vehicles.
 """
 MAX_WAITING_BYTES = 1 << 16
 """Number of bytes waiting to be sent to a slow vehicle. Above this number, further data for this vehicle are
@@ -64,7 +64,7 @@ class _Program:
     def __init__(self, number: int, directory: Path, keeper: socket.socket, process: ForkedProcess) -> None:
         self.number, self.directory, self.keeper, self.process = number, directory, keeper, process
         self.given: frozenset[str] = frozenset()
-        """The names of the files that the lab sent. They need not be sent back at the end."""
+        """The names of the files that the lab sent. The worker does not send these files back at the end."""
         self.output = FileTail(directory / OUTPUT)
         self._answers: deque[asyncio.Future[tuple[int | None, int | None]]] = deque()
 
@@ -107,7 +107,7 @@ class VehicleHost:
     """The vehicle programs of a run on this worker, and the connection to the lab."""
 
     def __init__(self, nursery: Nursery, directory: Path) -> None:
-        """Create the object. `directory` exists, and gets a directory for each program."""
+        """Create the object. `directory` must exist. The object creates a subdirectory in it for each program."""
         self._nursery, self._directory = nursery, directory
         self._loop = asyncio.get_running_loop()
         self._programs: dict[int, _Program] = {}
@@ -200,7 +200,7 @@ class VehicleHost:
             self._start(self._end(program, status))
 
     async def _end(self, program: _Program, status: int) -> None:
-        """Send the files of an ended program, remove them, and report the end."""
+        """Send the files of an ended program to the lab, remove these files, and report the end of the program."""
         await program.end()
         while self._send_output(program):
             await self._drain()

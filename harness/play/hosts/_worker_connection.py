@@ -1,8 +1,8 @@
 """The connection between the lab and one worker, which runs the vehicle programs of its agents.
 
-`harness.play.hosts._vehicle_host` is the other end, and describes the messages. The pilot of a vehicle and the ground
-station get one end of a socket pair for each of their TCP connections. This module copies data between the other end
-and the worker.
+`harness.play.hosts._vehicle_host` is the other end, and describes the messages. Each TCP connection of the ground
+station or of a vehicle's pilot uses a socket pair. The pilot or ground station uses one socket of the pair. This module
+copies data between the other socket and the worker.
 
 A worker counts as lost if its connection ends, or if it is silent for `LOST_AFTER_S`. Its vehicles are then lost, too.
 """
@@ -60,11 +60,11 @@ class FarVehicle(RunningProgram):
 
 
 class WorkerConnection:
-    """The connection to a worker. Create it in an event loop."""
+    """The connection to a worker. The object must be created while an event loop runs."""
 
     def __init__(self, worker: str, record_lag: Callable[[bytes], None]) -> None:
-        """Create the object without a connection. `worker` is the address of the worker. The function `record_lag` gets
-        each line with a measurement of the worker's delays.
+        """Create the object without a connection. `worker` is the address of the worker. The function `record_lag` is
+        called with each line that contains a measurement of the worker's delays.
         """
         self.worker = worker
         self._record_lag = record_lag
@@ -109,8 +109,9 @@ class WorkerConnection:
         self._connection.send(kind, json.dumps(document).encode())
 
     async def start(self, vehicle: int, argv: Sequence[str], directory: Path, output: Path) -> FarVehicle:
-        """Start the program of a vehicle with the files in `directory`. The files that it writes arrive there when it
-        ends. Raises SpawnError.
+        """Start the program of a vehicle on the worker, with a copy of the files in `directory`. After the end of the
+        program, the worker sends the files that the program wrote, and this object stores them in `directory`. Raises
+        SpawnError.
         """
         program = FarVehicle(next(self._numbers), self, output)
         files = {
@@ -219,7 +220,9 @@ class WorkerConnection:
         program.started.set_result(None)
 
     def _program(self, number: object) -> FarVehicle:
-        """Return a program that the worker names. Raises WireError if it does not exist."""
+        """Return the program with the number in a message of the worker. Raises WireError if no program has this
+        number.
+        """
         program = self._programs.get(number) if isinstance(number, int) else None
         if program is None:
             raise WireError("a message names an unknown vehicle program")

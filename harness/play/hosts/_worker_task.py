@@ -19,8 +19,8 @@ from sitl.installed import sha256
 
 @dataclass(frozen=True)
 class HostOrder:
-    """The order to a worker: the agents that it runs, and the address at which they join the run. An agent without a
-    command is the agent of the harness. `worker` is the address of the worker.
+    """The order to a worker: the agents that the worker runs, and the address at which these agents join the run. For
+    an agent without a command, the worker runs the harness's own agent program. `worker` is the address of the worker.
     """
 
     worker: str

@@ -2,7 +2,7 @@
 
 The first line of standard input is an order in JSON (`harness.play.hosts._worker_task.HostOrder`). The end of standard
 input ends the program and its agents, so they end with the worker. Each agent joins the run as with `ucp-harness join`.
-The worker itself joins, too, for the vehicle programs (`harness.play.hosts._vehicle_host`).
+For the vehicle programs, the worker itself opens one more connection (`harness.play.hosts._vehicle_host`).
 """
 
 import asyncio

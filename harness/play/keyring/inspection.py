@@ -70,7 +70,9 @@ def _shown(name: str, value: Any) -> str:
 
 def _inspect(path: Path) -> Facts:
     def private(document: Facts) -> Facts:
-        """Return the mission of a private key, and the public key that belongs to it."""
+        """Return the facts about a private key: the kind of the key, the mission, and the public key of the same key
+        pair.
+        """
         mission = key_in(document, "mission", MISSION_ID_BYTES).hex()
         private_key = key_in(document, "private_key", KEY_BYTES)
         if document["schema"] == DEPOT_SCHEMA:

@@ -123,7 +123,7 @@ class KeyDirectory:
     def write_bundles(
         self, directory: Path, agents: Sequence[int] | None = None, *, overwrite: bool = False
     ) -> list[Path]:
-        """Write a key file for each vehicle, which only the owner can read. Return the paths."""
+        """Write a key file for each vehicle. Only the user who owns the files can read them. Return their paths."""
         bundles = self.bundles(agents)
         paths = {agent_id: directory / bundle_name(agent_id) for agent_id in bundles}
         for path in paths.values():

@@ -115,7 +115,7 @@ def measure_engines(requirements: Iterable[MachineRequirement], say: Callable[[s
 
 
 def _with_progress(engine: str, observe: Observer, say: Callable[[str], None]) -> Observer:
-    """Return an observer that calls `observe`, and that first reports the measurement that is about to begin."""
+    """Return an observer that reports each measurement to the user, and then carries it out by calling `observe`."""
 
     def observe_and_report(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
         asked = len(study.questions)

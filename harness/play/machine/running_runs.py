@@ -1,8 +1,8 @@
 """Find the active runs on this machine by looking at the working directories of processes.
 
 A vehicle works in RUN/vehicles/ID. An agent works in RUN/agents, and in a later incarnation in RUN/agents/ID-NUMBER;
-its last argument is ID.mission.json. Both are in the network namespace of their vehicle, as a process or in a
-container. The harness therefore needs no list of active runs.
+its last argument is ID.mission.json. Both programs run in the network namespace of their vehicle, either directly or in
+a container. The harness therefore needs no list of active runs.
 """
 
 import contextlib
@@ -41,8 +41,8 @@ def _agent_of(entry: Path) -> bytes | None:
 
 
 def _in_another_network(entry: Path, proc: Path) -> bool:
-    """Return true if the process uses a different network than this process. The shell of a user in the run directory
-    uses the same network.
+    """Return true if the process uses a different network than this process. This check excludes a user's shell whose
+    working directory is in the run directory.
     """
     return (entry / "ns/net").readlink() != (proc / "self/ns/net").readlink()
 

@@ -109,8 +109,8 @@ class AgentProcess:
         controlled: Callable[[LabProgram], LabProgram] | None = None,
         loss: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Create the object without starting the process. `command` starts the agent. The harness appends the mission
-        file to it. `now` returns mission seconds.
+        """Create the object without starting the process. `command` starts the agent. The harness appends the path of
+        the mission file to this command. `now` returns mission seconds.
 
         A remote agent runs on another computer. For such an agent, `command` starts a stand-in on this machine.
         `controlled` then returns the program to control in place of the stand-in, and `loss` returns a phrase if the
@@ -165,7 +165,7 @@ class AgentProcess:
     ) -> None:
         """Start the program, and wait until it reports its status.
 
-        - `keeps_disk`: the agent stores its state in a file, so that it can reboot with it.
+        - `keeps_disk`: the agent stores its state in a file, so that it can reboot with this state.
         - `epoch_us`: start time of the mission that the agent joins. None if the mission has not started.
         - `keys`: the key directories of a secured mission.
 
@@ -425,7 +425,8 @@ class AgentProcess:
         """Return the error for an agent whose process ended without a request.
 
         If the process ended with exit status 127 before the start of the mission, the agent lacks a feature of the
-        mission. A shell also ends with 127 if it does not find a program.
+        mission. The exception is a shell that did not find the agent's program, because a shell then also ends with
+        127. The method recognizes this case by the message of the shell.
         """
         status, program = self._incarnations[-1].status, self._started
         words, end = program.last_line, str(program.ended())
@@ -441,8 +442,8 @@ class AgentProcess:
         return error
 
     def _failure(self, outcome: str, detail: str) -> HarnessError:
-        """Return the error for an agent that failed. If the computer of a remote agent is lost, the agent is not at
-        fault.
+        """Return the error for an agent that failed. If the connection to a remote agent's computer is lost, the agent
+        is not at fault, and the error is a MachineError.
         """
         if (loss := self._loss()) is not None:
             self.outcome, self.detail = "not exported", loss

@@ -44,8 +44,8 @@ class Fleet:
         watchers: MissionTasks,
         lost_worker: Callable[[int], str | None] | None = None,
     ) -> None:
-        """Create the vehicles without starting them. If vehicles run on the workers of a cluster, `lost_worker` returns
-        the address of a vehicle's worker if the worker is lost.
+        """Create the vehicles without starting them. If vehicles run on a cluster, `lost_worker` receives the ID of a
+        vehicle. It returns the address of the worker that ran the vehicle if this worker is lost, and otherwise None.
         """
         self._scenario = scenario
         self._kinds = kinds

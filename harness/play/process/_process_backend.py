@@ -80,7 +80,7 @@ class ProcessBackend(Backend):
         interactive: bool,
         hosts: "AgentHosts | None" = None,
     ) -> "ProgramRun":
-        """Return the run. The run is not open yet. If the agents run on other computers, `hosts` controls them."""
+        """Return the run without opening it. If the agents run on other computers, `hosts` controls these agents."""
         from harness.play.process._program_run import ProgramRun
         from harness.play.process.vehicle_kinds import choose_vehicles
 

@@ -83,8 +83,8 @@ class ProgramRun:
         - `interrupted`: ends the mission early when it is set.
         - `agent_commands`: command of each agent, without the mission file.
         - `open_lab`: opens a lab of processes or of containers.
-        - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only the agents that the scenario
-          reboots with their disk have one.
+        - `keeps_disks`: each agent has a disk with which it can reboot. Otherwise only agents that the scenario reboots
+          with their disk have a disk.
         - `hosts`: runs all agents and vehicles on other computers. By default, they run in the lab.
         """
         self.scenario = scenario
@@ -276,8 +276,8 @@ class ProgramRun:
         self.rundir.append_network(record)
 
     async def _strike_all(self, fault: Fault) -> None:
-        """Apply the fault to all its agents at the same time. If the fault is impossible for some of them, record the
-        reasons. Raises ScenarioError if the fault is impossible for all of them.
+        """Apply the fault at the same time to all agents that it names. If the fault is impossible for some of these
+        agents, record the reasons. Raises ScenarioError if it is impossible for all of them.
         """
         strikes = [self._apply_fault(fault, agent_id) for agent_id in fault.agents]
         problems = [problem for problem in await asyncio.gather(*strikes, return_exceptions=True) if problem]
@@ -356,9 +356,9 @@ class ProgramRun:
     async def _apply_conditions(self, change: NetworkChange, asked: NetworkConditions | None = None) -> None:
         """Apply and record the network conditions of a change.
 
-        For a change of the timeline, `asked` contains the requested conditions, and the record contains both the
-        requested and the applied conditions. For a change by the movement of vehicles, the record contains only the
-        change.
+        For a change that the timeline requests, `asked` contains the requested conditions, and the record contains both
+        the requested and the applied conditions. For a change that the movement of vehicles causes, the record contains
+        only the change.
         """
         async with self._changing_network:  # apply changes in the order of their requests
             conditions = add_rogue_listener(change.conditions, self.scenario)
@@ -383,7 +383,9 @@ class ProgramRun:
             self._watchers.start(self._cut_off())
 
     async def _cut_off(self) -> None:
-        """Cut off the vehicles whose connections are lost, and connect the vehicles whose connections are back."""
+        """Disconnect the vehicles of remote agents whose connections are lost. Reconnect a vehicle after the connection
+        of its agent is restored.
+        """
         await self._apply_conditions(self._reach.cut_off(self.clock.now(), self._remote.cut_off))
 
     def _without_rogue(self, applied: AppliedConditions) -> dict[str, Any]:
@@ -394,7 +396,7 @@ class ProgramRun:
         return figures
 
     async def _follow_flight(self) -> None:
-        """Record the positions of the vehicles, and adapt the radio losses to them."""
+        """Record the positions of the vehicles, and update the radio losses for these positions."""
         radio = self.scenario.network.radio
         every_s = max(MIN_FOLLOW_S, self.clock.wall_s(radio.update_s if radio else TRACK_S))
         while True:
@@ -469,13 +471,13 @@ class ProgramRun:
         return replace(self.played, mission_s=mission_s, agents=agents, channel=channel, remote=remote)
 
     def _reachable_agents(self) -> list[AgentProcess]:
-        """Return the agents that are reachable: not dead, not paused, and not cut off from their computer."""
+        """Return the agents that are reachable: not dead and not paused. A remote agent is not reachable if the
+        connection to its computer is lost.
+        """
         return [agent for agent in self.agents if agent.awake and agent.agent_id not in self._remote.cut_off]
 
     async def _statuses(self) -> dict[int, AgentStatus]:
-        """Return the status of each agent that is reachable: not dead, not paused, and not cut off from its
-        computer.
-        """
+        """Return the status of each reachable agent (see `_reachable_agents`)."""
         agents = [agent for agent in self.agents if agent.agent_id not in self._remote.cut_off]
         polled = await asyncio.gather(*(agent.poll() for agent in agents))
         return {agent.agent_id: status for agent, status in zip(agents, polled, strict=True) if status}
@@ -549,7 +551,8 @@ class ProgramRun:
 
     def _datagram_counters(self, counted: Mapping[int, UdpCounters]) -> dict[str, DatagramsRead]:
         """Return the datagram counters of the agents for run.json. Omit agents whose vehicle program also uses UDP,
-        because their counters contain its datagrams. Omit agents that were cut off from their stand-ins, too.
+        because these counters would also count the datagrams of the vehicle program. Omit agents that were cut off from
+        their stand-ins, too.
         """
         agents = [
             agent

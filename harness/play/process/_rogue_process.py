@@ -19,7 +19,7 @@ from netem.lab import Lab
 
 
 class RogueProcess:
-    """The process of the rogue node. `vehicle` is its ID in the network. No agent has this ID."""
+    """The process of the rogue node. `vehicle` is the ID of the rogue node in the network. No agent has this ID."""
 
     def __init__(self, vehicle: int, scenario: Scenario, seed: int, rundir: RunDirectory) -> None:
         self.vehicle = vehicle

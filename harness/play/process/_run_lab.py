@@ -80,7 +80,7 @@ class MissionLab(VehicleLab, Protocol):
 
 
 OpenLab = Callable[[Scenario, RunDirectory, Callable[[str], None]], Awaitable[MissionLab]]
-"""A function that opens the lab of a run. The last argument shows slow steps to the user.
+"""A function that opens the lab of a run. The last argument is a function that reports slow steps to the user.
 
 Raises NetemError or HarnessError.
 """

@@ -38,8 +38,8 @@ class VehicleFailedError(HarnessError):
 
 class VehicleProcess:
     """The program of one vehicle. `sysid` is the MAVLink system ID of the vehicle. `incarnation` is 1 for the first
-    program of the vehicle, 2 for its first replacement, and so on. `lost_worker` returns None, or the address of the
-    computer that runs the program if the connection to it is lost.
+    program of the vehicle, 2 for its first replacement, and so on. `lost_worker` returns None while the computer that
+    runs the program is connected. After the loss of the connection, it returns the address of this computer.
     """
 
     def __init__(
@@ -63,8 +63,8 @@ class VehicleProcess:
         self._station_port = STATION_PORT
         self._lost_worker = lost_worker
         self._lost_with: str | None = None
-        """The address of the worker (a computer of a cluster) that ran the vehicle, if the vehicle was lost because the
-        worker was lost.
+        """The address of the worker (a computer of a cluster) that ran the vehicle, if the worker was lost. Otherwise
+        None.
         """
 
     @property
@@ -138,7 +138,9 @@ class VehicleProcess:
         return Place(*field.metres_to(position.lat_deg, position.lon_deg, position.alt_m))
 
     def prepare(self, flight: Flight | None, altitude_m: float) -> None:
-        """Choose the flight of the vehicle. If `flight` is None, the vehicle only climbs to `altitude_m` metres."""
+        """Set the flight that the vehicle performs later. If `flight` is None, the vehicle only climbs to `altitude_m`
+        metres.
+        """
         assert self.pilot is not None
         self._flight = self.pilot.flight(flight.to_plan(), flight.by) if flight else self.pilot.ascent(altitude_m)
 

@@ -1,8 +1,9 @@
 """Start, stop and query a program in a virtual network that answers commands on a control socket. The program is an
 agent, or a node of the harness.
 
-The rooms that run agents judge a failure differently. A mission ends, a conformance case fails, and a bisection skips
-the program. Therefore this driver raises errors without a verdict, and its callers replace them by their own errors.
+The consequence of a failure depends on the caller: a mission ends, a conformance case fails, and a bisection skips the
+program. This module therefore only reports failures, in errors of its own. Each caller converts these errors to its own
+errors.
 """
 
 import asyncio
@@ -84,7 +85,8 @@ class ControlledProgram:
         """Start the program in `directory` without waiting until it is ready. Its output goes to `log`.
 
         The time limit of an answer is ANSWER_LIMIT_S by default. If `has_children` is false, the program starts no
-        other processes, and the harness does not search for them at its end. Raises SpawnError, NetemError.
+        other processes, and the harness does not search for such processes after the end of the program. Raises
+        SpawnError, NetemError.
         """
         children = ChildProcesses()
         env = children.environment(os.environ)

@@ -19,8 +19,8 @@ class LabProgram(Protocol):
 
     @property
     def left_behind(self) -> Sequence[str]:
-        """The names of the processes that `terminate` ended together with the container of the program. Without a
-        container, these processes continue, and the list is empty.
+        """The names of the processes that the program left behind, and that `terminate` ended together with the
+        program's container. If the program runs without a container, such processes continue, and the list is empty.
         """
 
     async def wait(self) -> int:

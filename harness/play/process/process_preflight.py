@@ -43,7 +43,7 @@ def refuse_virtual_time_keys(scenario: Scenario) -> None:
 
 
 def network_needs(scenario: Scenario) -> list[str]:
-    """Return the network features, in addition to loss and partitions, that the scenario needs.
+    """Return the network features that the scenario needs, except loss and partitions.
 
     Raises ScenarioError for conditions that are impossible at the speedup of the scenario.
     """
@@ -51,8 +51,8 @@ def network_needs(scenario: Scenario) -> list[str]:
 
 
 def add_rogue_listener(conditions: NetworkConditions, scenario: Scenario) -> NetworkConditions:
-    """Return the network conditions. If the scenario has a rogue node, the result also has links from the agents to the
-    rogue node, without loss and delay.
+    """Return the network conditions. If the scenario has a rogue node, add links without loss and delay from the agents
+    to the rogue node.
     """
     return conditions.with_listener(scenario.rogue, scenario.roster) if scenario.rogue else conditions
 
@@ -61,8 +61,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
     """Return all different network conditions that occur in the scenario, without partitions and at the scenario's
     speed.
 
-    If the scenario has a radio model, one link in each of these conditions has an additional loss. The conditions then
-    contain links with different losses, as during a flight.
+    If the scenario has a radio model, one link in each of these conditions has an additional loss, so that the losses
+    of links differ as during a flight.
     """
     states = [change.conditions for change in timeline_of(scenario) if isinstance(change, NetworkChange)]
     out_of_reach = {frozenset(scenario.roster[:2]): 0.5} if scenario.network.radio else {}
@@ -82,8 +82,8 @@ def _network_states(scenario: Scenario) -> list[NetworkConditions]:
 def refuse_unsupported_network(scenario: Scenario) -> None:
     """Raise MachineError with a solution if this machine cannot create the network conditions of the scenario.
 
-    If the scenario needs more than loss and partitions, the function opens a lab for a fraction of a second. In this
-    lab, it applies the conditions that some kernels reject.
+    If the scenario needs more than loss and partitions, the function opens a lab for a fraction of a second and applies
+    the conditions of the scenario, because some kernels reject some conditions.
     """
     needs = network_needs(scenario)
     uncertain = [network for network in _network_states(scenario) if may_refuse(network)]

@@ -13,9 +13,10 @@ from sitl.vehicle import NoBinaryError, NoProgramError, VehicleError, VehicleKin
 def choose_vehicles(scenario: Scenario) -> dict[int, VehicleKind]:
     """Return the program of each vehicle.
 
-    Return an empty result if the scenario has no vehicles. If the scenario does not name a kind of vehicle, all
-    vehicles are ArduPilot if all binaries exist, and otherwise all are embedded vehicles. Raises VehicleFailedError for
-    an unusable binary or an impossible vehicle set-up, and MachineError if a required program is missing.
+    Return an empty result if the scenario has no vehicles. If the scenario does not name a kind of vehicle, and all
+    ArduPilot binaries exist, all vehicles run ArduPilot. If a binary is missing, all vehicles use the embedded vehicle
+    model. Raises VehicleFailedError for an unusable binary or an impossible vehicle set-up, and MachineError if a
+    required program is missing.
     """
     vehicles = scenario.vehicles
     if vehicles.kind == "none":

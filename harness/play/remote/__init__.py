@@ -3,7 +3,8 @@
 The harness starts a *stand-in* in the network of the vehicle, in place of the agent. The stand-in is a program under
 the agent contract. Start, kill, pause, traces, exports, losses, partitions and radio therefore work as for any agent.
 The *far end* is `ucp-harness join` on the other computer. It starts the agent in a private network with the same
-addresses. One TCP connection joins both, and carries everything: datagrams, requests, the trace and the export.
+addresses. One TCP connection joins the stand-in and the far end, and carries all data between them: datagrams,
+requests, the trace and the export.
 
 A UDP tunnel for the datagrams would have less delay on a link that loses packets. The connection is better for a test:
 

@@ -39,7 +39,7 @@ class Connection(asyncio.Protocol):
         self.send_together([(kind, payload)])
 
     def send_together(self, messages: Iterable[tuple[Kind, bytes]]) -> None:
-        """Send messages at once, so that the other end of the connection wakes up only once for all of them."""
+        """Send several messages together, so that the other end of the connection wakes up only once."""
         if self._transport is not None:
             self._transport.write(b"".join(self._channel.encode(kind, payload) for kind, payload in messages))
 

@@ -1,8 +1,9 @@
 """Measure the clock of a far computer and the delay of the connection, as NTP does (RFC 5905, section 8).
 
-A ping has the sending time t1 of this machine. The pong adds the time t2 of the far computer, and arrives at t3. If
-both ways take the same time, the far clock is ahead by t2 - (t1 + t3) / 2. The error is at most half of the round trip
-t3 - t1, whatever the two ways take. The ping with the shortest round trip is therefore the best one.
+A ping has the sending time t1 of this machine. The pong adds the time t2 of the far computer, and arrives at t3. If the
+ping and the pong take the same time, the far clock is ahead by t2 - (t1 + t3) / 2. If the two ways take different
+times, the error is at most half of the round trip time t3 - t1. The ping with the shortest round trip is therefore the
+best one.
 
 The far computer sends two times. Its wall clock gives the offset, because an agent reads the wall clock when its
 mission begins. Its monotonic clock gives the drift, because nothing sets that clock.

@@ -1,4 +1,4 @@
-"""Accept the connections of other computers on which agents run (far ends), and pass each of them to a stand-in.
+"""Accept the connections of other computers on which agents run (far ends), and pass each connection to a stand-in.
 
 A stand-in is the local program that represents such an agent. Runs (`_remote_agents`) and conformance tests
 (`agent_pool`) use this module through the interface `Host`. The host decides which far ends it accepts, and which
@@ -29,8 +29,8 @@ from ucp.features import CONTRACT
 
 SOCKET = "join"
 WORKER = 0
-"""The agent ID that the worker of a cluster sends when it connects for its vehicles, not for an agent
-(`harness.play.hosts`). The session is then the address of the worker.
+"""The ID that a worker of a cluster sends in place of an agent ID, when it connects for its vehicles
+(`harness.play.hosts`). In this case, the session is the address of the worker.
 """
 JOIN_LIMIT_S = 300.0
 """Seconds of wall time in which all far ends must connect."""
@@ -108,9 +108,7 @@ class Host(Protocol):
         """Accept a new connection of a far end. Raises HandshakeError, WireError or OSError if the connection fails."""
 
     def begin(self, number: int, stand_in: socket.socket) -> None:
-        """Accept the connection of a new stand-in. `number` is the number in its task, which identifies the
-        stand-in.
-        """
+        """Accept the connection of a new stand-in. `number` identifies the stand-in, as `StandInTask.number` does."""
 
     def hear(self, number: int, stand_in: socket.socket, message: dict[str, Any]) -> None:
         """Handle a message of a stand-in. An empty message means that the stand-in has ended."""
@@ -122,9 +120,9 @@ class FarEnds:
     def __init__(self, host: Host, name: str, *, places: int = 1, agents: int = 1, has_keys: bool = False) -> None:
         """Create the object without listening. `name` describes the run to the user of the other computer.
 
-        `places` is the number of incarnations that each far end runs at the same time, and `agents` the number of
-        agents that may join at the same time. If `has_keys` is true, the agents get keys, and only encrypted
-        connections are accepted.
+        `places` is the number of incarnations that each far end runs at the same time. `agents` is the number of agents
+        that may join at the same time. If `has_keys` is true, the agents get keys, and only encrypted connections are
+        accepted.
         """
         self._max_handshakes = MAX_HANDSHAKES + agents
         self._host, self._name, self._places, self._has_keys = host, name, places, has_keys
@@ -165,7 +163,9 @@ class FarEnds:
             path.unlink(missing_ok=True)
 
     async def stop_listening(self) -> None:
-        """Close the listening sockets. A far end whose agent has ended then knows that no other incarnation follows."""
+        """Close the listening sockets. If a far end then fails to connect again, it knows that no other incarnation of
+        its agent follows.
+        """
         for task in self._accepting.values():
             task.cancel()
         await asyncio.gather(*self._accepting.values(), return_exceptions=True)
@@ -253,8 +253,8 @@ class FarEnds:
             loop.add_reader(stand_in, self._hear, number, stand_in)
 
     def _hear(self, number: int, stand_in: socket.socket) -> None:
-        """Read all messages of a stand-in that have arrived. It sends them before the answer of its agent, so the host
-        knows them before it reads this answer.
+        """Read all messages of a stand-in that have arrived. A stand-in sends these messages before it sends the answer
+        of its agent. The host therefore reads the messages before the answer.
         """
         data = b"-"
         while data:

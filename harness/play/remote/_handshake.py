@@ -93,8 +93,8 @@ async def receive_hello(connection: socket.socket, secret: bytes) -> Hello:
 
 
 async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, Any]) -> tuple[Channel, dict[str, Any]]:
-    """Answer the challenge of the harness. Return the channel of the connection, and the `welcome` of the harness.
-    Raises RefusedError, HandshakeError or OSError.
+    """Answer the challenge of the harness. Return the channel of the connection, and the `welcome` that the harness
+    sent. Raises RefusedError, HandshakeError or OSError.
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(HANDSHAKE_LIMIT_S):
@@ -119,8 +119,8 @@ async def introduce(connection: socket.socket, secret: bytes, hello: dict[str, A
 
 
 def _shared(exchange: KeyExchange, words: dict[str, Any]) -> bytes | None:
-    """Return the secret that both ends compute by the key exchange. Return None if an end lacks the package
-    cryptography. Remove the public key from `words`. Raises HandshakeError if the public key is invalid.
+    """Remove the public key of the other end from `words`. Return the secret that both ends compute in the key
+    exchange. Return None if an end lacks the package cryptography. Raises HandshakeError if the public key is invalid.
     """
     try:
         return exchange.shared(words.pop("share", None))

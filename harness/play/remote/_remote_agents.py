@@ -1,8 +1,8 @@
 """Let agents on other computers take part in a run.
 
 A far end may connect at any time of a run. Its connection waits here until a stand-in needs it, or replaces the lost
-connection of a stand-in. Each connection carries at most one incarnation of an agent. After it, the far end connects
-again.
+connection of a stand-in. Each connection carries at most one incarnation of an agent. After the end of the incarnation,
+the far end connects again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _RemoteVehicle:
     command: list[str] = field(default_factory=list)
     session: str = ""
     held: FarEnd | None = None
-    """A connection to the other computer that is ready for the next incarnation of the agent. None if there is none."""
+    """An unused connection to the other computer for the next incarnation of the agent, or None."""
     stand_in: socket.socket | None = None
     offset_s: float | None = None
     epoch_us: int | None = None
@@ -76,8 +76,8 @@ class RemoteAgents:
     def __init__(
         self, scenario: Scenario, rundir: RunDirectory, now: Callable[[], float], hosts: AgentHosts | None = None
     ) -> None:
-        """Prepare for remote agents. `hosts` are the cluster workers that run all agents of the run. If it is None,
-        users let agents join.
+        """Prepare for remote agents. `hosts` are the cluster workers that run all agents of the run. Without a cluster,
+        `hosts` is None, and users on other computers let the agents join.
         """
         self._scenario, self._rundir, self._now, self._hosts = scenario, rundir, now, hosts
         agents = hosts.agents if hosts else scenario.remote.agents if scenario.remote else ()
@@ -100,8 +100,8 @@ class RemoteAgents:
         return agent_id in self._vehicles and bool(self._vehicles[agent_id].cuts)
 
     def loss(self, agent_id: int) -> str | None:
-        """Return a phrase if no far end plays the agent. The phrase completes a sentence that starts with "agent 7".
-        Return None if a far end plays the agent.
+        """Return None if a far end runs the agent. Otherwise return a phrase that completes a sentence that starts with
+        "agent 7".
         """
         vehicle = self._vehicles[agent_id]
         if vehicle.is_connected:
@@ -286,8 +286,8 @@ class RemoteAgents:
         """Return network conditions in wall time. The delay of the connection is subtracted from the delay of each
         link.
 
-        Raises ScenarioError if a link must have a shorter delay than its connections have. A link for which the
-        scenario asks for no delay keeps the delay of its connections, which the record shows.
+        Raises ScenarioError if a link must have a shorter delay than the connections of its agents have. If the
+        scenario sets no delay for a link, the link has the delay of these connections. The record shows this delay.
         """
         if not self._vehicles:
             return conditions

@@ -1,6 +1,5 @@
-"""Describe the task of a stand-in, which the harness passes on its command line.
-
-The task does not come from the mission file, because a conformance test also uses mission files that are wrong.
+"""Describe the task of a stand-in. The harness passes the task on the command line of the stand-in, and not in the
+mission file, because a conformance test also uses invalid mission files.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ class Channel:
         return messages
 
     def to_json(self) -> dict[str, Any]:
-        """Return the state of the channel, with which another process can continue to use the connection. The caller
-        must have read the last message completely.
+        """Return the state of the channel, so that another process can continue to use the connection. The caller must
+        have read the last message completely.
         """
         assert not self._unread, "a message is incomplete"
         return {
@@ -220,16 +220,16 @@ secured mission.
 
 
 def hand_over(inside: socket.socket, connection: socket.socket, state: dict[str, Any]) -> None:
-    """Send a connected socket and the state of its channel to the process inside the private network, and close the
-    socket. Raises OSError.
+    """Send a connected socket and the state of its channel to the process inside the private network. Then close the
+    socket in this process. Raises OSError.
     """
     with connection:
         socket.send_fds(inside, [json.dumps(state).encode()], [connection.fileno()])
 
 
 def take_over(outside: socket.socket) -> tuple[socket.socket, dict[str, Any]] | None:
-    """Return a connected socket and its state, which the process outside has sent. Return None if that process has
-    ended. Raises BlockingIOError if no socket has arrived.
+    """Return the connected socket and the state of its channel that the process outside has sent. Return None if that
+    process has ended. Raises BlockingIOError if no socket has arrived.
     """
     data, descriptors, _, _ = socket.recv_fds(outside, HANDED_OVER_BYTES, 1)
     if not data:

@@ -1,8 +1,8 @@
 """Run the agents of a conformance test on another computer.
 
 A conformance test starts many incarnations of one agent, and several of them run at the same time. The far end keeps
-one connection for each of these. A stand-in gets any connection that waits, and the far end replaces the connection
-afterwards.
+one connection ready for each of these incarnations. A stand-in uses any of the ready connections, and the far end then
+opens a new one.
 
 A lost connection ends the test, because the inputs of the agent during the gap are unknown.
 """

@@ -4,9 +4,9 @@ The program is the first process of a private network (see `netem.far_network`),
 the agent started. The process outside (`harness.play.remote.join`) sends it connected sockets through the socket FD.
 The link `keys` in DIRECTORY leads to a directory in memory, for the keys of a secured mission.
 
-The program waits for the message `begin`, runs one incarnation of the agent, and ends. If the connection is lost
-meanwhile, the agent goes on. The program then asks the process outside for another connection by sending `lost`, and
-continues where it was.
+The program waits for the message `begin`, runs one incarnation of the agent, and ends. If the connection is lost before
+the end, the agent continues. The program then sends `lost` to the process outside, receives another connection, and
+resumes the communication where it stopped.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class FarWorker:
         """
         self._pinged_s = self._loop.time()
         self._frames = 0
-        """Number of datagrams that the agent has sent, whether or not they left this computer."""
+        """Number of datagrams that the agent has sent, including datagrams that did not leave this computer."""
         self._incarnation: str | None = None
         self._agent_id = 0
         self._home = directory
@@ -308,7 +308,7 @@ class FarWorker:
             return
 
     def _request(self, payload: bytes) -> None:
-        """Forward a request to the agent: a number of 4 bytes, and a line."""
+        """Forward a request to the agent. The request consists of a number of 4 bytes and a line."""
         number, line = payload[:NUMBER_BYTES], payload[NUMBER_BYTES:]
         if self._control is None:
             self._send(Kind.ANSWER, number)
@@ -321,7 +321,9 @@ class FarWorker:
                 self._start(self._measure_lag(request["epoch_us"]))
 
     async def _forward_answers(self, reader: asyncio.StreamReader) -> None:
-        """Send each answer of the agent. First send the trace lines and the export that belong to the answer."""
+        """Send each answer of the agent to the harness. Before the answer, send new trace lines, and the export if the
+        answer names one.
+        """
         with contextlib.suppress(OSError, ValueError):  # the agent closed the socket, or sent an endless line
             while (line := await reader.readline()).endswith(b"\n") and self._asked:
                 self._send_new_lines()

@@ -1,9 +1,9 @@
 """Let an agent on this computer join the labs of a harness on another computer.
 
 A run needs one incarnation of the agent at a time, and a conformance test needs several at the same time. For each
-incarnation, this process connects to the harness, proves that it knows the secret, and starts a process in a
-private network (`harness.play.remote.far_worker`). It hands the connection over, and makes another one when the worker
-asks for it. The worker runs the agent.
+incarnation, this process connects to the harness, proves that it knows the secret, and starts a process in a private
+network (`harness.play.remote.far_worker`). The started process, the worker, receives the connection and runs the agent.
+If the worker asks for another connection, this process opens one and passes it to the worker.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ REJOIN_LIMIT_S = 60.0
 MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
-"""Minimum age in seconds of a directory without a lock that belongs to a killed process. A younger one may be new and
-not yet locked.
+"""Age in seconds from which a directory without a lock counts as the directory of a killed process. A younger directory
+may be new and not yet locked.
 """
 
 
@@ -122,9 +122,9 @@ class RunOverError(Exception):
 
 
 def join(request: JoinRequest, say: Callable[[str], None]) -> None:
-    """Run incarnations of the agent until the run has ended. As a service, continue with the next run, without end.
-    Raises MachineError if this machine has no private networks. Raises JoinError if no harness listens, or if the
-    harness refuses the agent.
+    """Run incarnations of the agent until the run has ended. If the request has `service`, continue with the next run,
+    without end. Raises MachineError if this machine has no private networks. Raises JoinError if no harness listens, or
+    if the harness refuses the agent.
     """
     try:
         first_process = far_network.first_process([sys.executable, "-P", "-m", "harness.play.remote.far_worker"])
@@ -158,7 +158,8 @@ async def _start_worker(
 @contextmanager
 def directory_of_agents() -> Iterator[Path]:
     """Create a directory for the agent's files, and remove it afterwards. Also remove the directories of killed
-    processes. A lock shows that the process of a directory still runs. A new directory has no lock for a moment.
+    processes. A directory is kept if it is locked, because its process then still runs, or if it is younger than
+    `NEW_S`, because a new directory has no lock for a moment.
     """
     for path in Path(tempfile.gettempdir()).glob(f"{DIRECTORY}*"):
         with contextlib.suppress(OSError):  # of another user, or in use
@@ -208,7 +209,9 @@ class _Joining:
                 await playing
 
     async def play(self, directory: Path) -> None:
-        """Run the agent until the run has ended, or without end as a service. Raises JoinError."""
+        """Run the agent until the run has ended. If the request has `service`, run the agent in all later runs, too,
+        without end. Raises JoinError.
+        """
         joined = False
         while True:
             try:

@@ -5,8 +5,8 @@ between the lab and the far end, which runs the agent. SOCKET belongs to the har
 through it (see `harness.play.remote._far_ends`), and receives measurements. TASK is a `StandInTask`.
 
 - The trace, the log and the export arrive before the datagrams and answers that depend on them.
-- If the connection is lost, the vehicle is cut off. The agent goes on, and so does this program: it answers `status`
-  with the last answer of the agent, and waits for another connection.
+- If the connection is lost, the vehicle is cut off. The agent goes on, and so does this program: it answers the command
+  `status` with the last status of the agent, and waits for another connection.
 - SIGUSR1 and SIGUSR2 suspend and resume the agent, and SIGQUIT kills it, as SIGSTOP, SIGCONT and SIGKILL would.
 - The program ends as the agent ended, by the same signal or with the same exit status.
 """
@@ -86,7 +86,7 @@ class StandIn:
         self._ponged_s = self._loop.time()
         self._begun = False
         self._order: bytes | None = None
-        """The message with which the far end begins the incarnation. None if the far end has never joined."""
+        """The message to the far end that begins the incarnation. None if the far end has never joined."""
         self._heard = False
         """True if the far end has begun the incarnation."""
         self._offset_s: float | None = None
@@ -99,7 +99,7 @@ class StandIn:
         self._opening: asyncio.Task[None] | None = None
         self._paused = False
         self._released = 0
-        """Number of the agent's datagrams that this program sent to the lab."""
+        """Number of datagrams of the agent that this program broadcast in the lab."""
         self._lost = 0
         self._trace = (directory / f"{self._agent_id}.trace.jsonl").open("ab", buffering=0)
         self._trace_problem: str | None = None
@@ -496,7 +496,7 @@ class StandIn:
             self._loop.add_reader(self._udp, self._arrive)
 
     def _kill(self) -> None:
-        """Kill the agent, and wait for the rest of its trace."""
+        """Kill the agent, and wait until the remaining lines of its trace have arrived."""
         if self._connection is None or self._cut_off:
             self._end(-signal.SIGKILL)
             return

@@ -52,8 +52,8 @@ class CapturedKeys:
     def sealed(
         self, sender: int, sequence: int, message: Message, request: AnsweredRequest | None, now: float, now_us: int
     ) -> bytes:
-        """Return an encrypted datagram in the name of `sender`. The datagram is as genuine as these keys allow. Use
-        each sequence number once.
+        """Return an encrypted datagram in the name of `sender`. The encryption is valid. If a block has no known
+        genuine signature, it is signed with the key of the captured vehicle. Use each sequence number once.
         """
         session = self._sessions.get(sender)
         if session is None:
@@ -67,7 +67,7 @@ class CapturedKeys:
         return session.seal(sequence, message, request, signature, 0)
 
     def _session(self, sender: int, now_us: int) -> Session:
-        """Return a forged session of the sender that begins now, as after a restart. Receivers prefer it, because it is
-        newer than the sender's genuine session.
+        """Return a forged session of the sender that begins now, as after a restart. Receivers prefer this session to
+        the sender's genuine session, because it is newer.
         """
         return Session(replace(self._bundle, agent_id=sender), make_boot(now_us, self._random_bytes()))

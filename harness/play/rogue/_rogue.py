@@ -44,13 +44,15 @@ if TYPE_CHECKING:
 MAX_REMEMBERED = 10_000
 """Maximum number of received datagrams that the rogue node keeps for replays."""
 MAX_WAITING = 100_000
-"""Maximum number of datagrams that wait to be sent. If this number waits, the rogue node creates no further ones."""
+"""Maximum number of datagrams that wait to be sent. If this number is reached, the rogue node creates no further
+datagrams.
+"""
 FLOOD_BATCH = 64
 """Maximum number of messages of a flood that the rogue node sends before it does other work."""
 
 
 QUERY_OF_ANSWER = {NAMES[answer]: NAMES[query] for answer, query in REQUEST_OF.items()}
-"""The name of the query or request to which each answer belongs, by the name of the answer."""
+"""Name of an answer -> name of the query or request that it answers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +104,9 @@ class _ActiveInjection:
 
 
 class RogueLogic:
-    """The state of the rogue node: received messages, active injections, and datagrams to send.
-
-    `epoch_us` is mission second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured
-    vehicle. `initial_data` is the data of the inception block. Forged messages about chains need it.
+    """The state of the rogue node: received messages, active injections, and datagrams to send. `epoch_us` is mission
+    second 0 on the agents' clocks, in microseconds. `captured` are the keys of a captured vehicle. `initial_data` is
+    the data of the inception block, which the rogue node needs to forge messages about chains.
     """
 
     def __init__(
@@ -168,8 +169,8 @@ class RogueLogic:
         return clear.sender, NAMES.get(clear.type, ""), *(opened or (None, None))
 
     def begin(self, number: int, injection: Injection, now: float) -> None:
-        """Begin injection number `number`, counted from 1. An injection without a duration (a replay, a `lie` or some
-        forgeries) also ends in this call.
+        """Begin injection number `number`, counted from 1. If the injection has no duration (a replay, a `lie` or some
+        forgeries), it also ends in this call.
         """
         self.sent[number] += 0
         if isinstance(injection, Replay):

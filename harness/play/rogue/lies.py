@@ -31,10 +31,9 @@ class UnknownBlockError(Exception):
 
 
 class KnownBlocks:
-    """An index of the blocks that the rogue node has received, by agent and in the order of their proposals.
-
-    `initial_data` belongs to the inception block. `epoch_us` is mission second 0 on the agents' clocks, in
-    microseconds.
+    """An index of the blocks that the rogue node has received. For each agent, it lists the blocks in the order in
+    which the agent proposed them. `initial_data` is the data of the inception block. `epoch_us` is mission second 0 on
+    the agents' clocks, in microseconds.
     """
 
     def __init__(self, initial_data: bytes, epoch_us: int = 0) -> None:
@@ -109,5 +108,5 @@ class KnownBlocks:
 
 
 def made_block(agent_id: int, timestamp_us: int) -> Block:
-    """Return a forged block. It bears the ID of an agent that never completed it."""
+    """Return a forged block. The block contains the ID of an agent that never completed such a block."""
     return Block(agent_id, timestamp_us, LoggableEvent(timestamp_us, 1, b"made by its captor").encode())

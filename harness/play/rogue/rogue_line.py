@@ -40,7 +40,7 @@ def _secured(datagram: bytes) -> dict[str, object]:
 FORGED_FROM = 1 << 31
 """First sequence number of forged datagrams. It is so high that agents never reach it."""
 _EACH = 1 << 17
-"""Number of sequence numbers that each injection may use. No flood has as many datagrams."""
+"""Number of sequence numbers that each injection may use. Even a flood has fewer datagrams."""
 
 
 def forged_sequence(injection: int, count: int) -> int:

@@ -1,8 +1,9 @@
 """Write packet capture files of a simulated run, one for the network interface of each vehicle.
 
 The files have the format of `netem.capture`, and contain the frames that a kernel would send. Mission second 0 is the
-Unix epoch, at speedup 1. The files of a paused or dead agent also contain the frames that reach its interface. A
-corrupted copy of a frame is in no file of a receiver, because the simulation does not deliver it.
+Unix epoch, at speedup 1. The files of a paused or dead agent also contain the frames that reach its interface. If a
+receiver's copy of a frame is corrupted, the receiver's file lacks this frame, because the simulation does not deliver
+corrupted copies.
 """
 
 from collections.abc import Iterator, Sequence
@@ -23,7 +24,7 @@ FRAMES_KEPT = 4096
 
 
 class VirtualCapture:
-    """The packet capture files of all vehicles, in `folder`. Methods that write raise OSError."""
+    """The packet capture files of all vehicles. The files are in `folder`. Methods that write raise OSError."""
 
     def __init__(self, folder: Path, roster: Sequence[int]) -> None:
         self._roster = roster

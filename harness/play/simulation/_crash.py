@@ -1,8 +1,8 @@
 """Decide whether an error during a simulation is the failure of an agent.
 
 A foreign agent is a separate program, and its failures are errors of their own class. The harness's own agents run in
-the process of the harness. An engineer edits their core in place, so an exception that comes out of `ucp` is a failure
-of the agent, like the end of an agent's process. Any other exception is an error of the harness.
+the process of the harness. An engineer edits their core in place, so an exception in the code of `ucp` counts as a
+failure of the agent, like the crash of an agent's process. Any other exception is an error of the harness.
 """
 
 from pathlib import Path
@@ -18,9 +18,8 @@ MAX_WORDS = 200
 
 
 def agent_failure(incarnation: SimulatedIncarnation | None, error: Exception, at_s: float) -> AgentFailedError | None:
-    """Return the failure of an agent if an agent caused the error. Return None if the harness caused it.
-
-    `incarnation` is the agent that handled an input or a query at mission second `at_s`.
+    """If an agent caused the error, return the failure of this agent. If the harness caused the error, return None.
+    `incarnation` is the agent that was handling an input or a query at mission second `at_s`.
     """
     if isinstance(error, AgentFailedError):
         return error

@@ -1,13 +1,14 @@
 """Cache cryptographic results for all agents of a simulated mission.
 
 All agents receive the same bytes. The header, the sender's keys, the plaintext and the validity of the signature depend
-only on keys and bytes. The cache stores these results by the keys and bytes. If a receiver has a different secret,
-public key or datagram, it never gets the cached result of another receiver. Checks that depend on the receiver are not
-cached: freshness, the current epoch, its own queries, and revocations.
+only on the keys and on the bytes of the datagram. The cache therefore stores these results by keys and bytes. A
+receiver with a different secret, public key or datagram never uses the cached result of another receiver. Checks that
+depend on the receiver are not cached: freshness, the current epoch, its own queries, and revocations.
 
-A signature is valid if it was made in this process over the same bytes with the private key of the same key pair. Such
-a signature is not verified again, except one in `VERIFIED_EVERY`, which detects a library that cannot verify its own
-signatures. All other signatures are verified. A full cache drops its oldest entries, which only costs time.
+A signature is valid if it was made in this process over the same bytes with the private key of the same key pair. The
+cache does not verify such a signature again. The exception is one of every `VERIFIED_EVERY` signatures, because this
+check detects a library that cannot verify its own signatures. All other signatures are verified. A full cache drops its
+oldest entries. The dropped results are then computed again.
 """
 
 from functools import lru_cache
@@ -45,7 +46,7 @@ class RecordedSignatures:
 
     def __init__(self) -> None:
         self._made: dict[bytes, tuple[bytes, bytes]] = {}
-        """The signed bytes and the public key of the signing key pair, by signature."""
+        """Signature -> the signed bytes, and the public key of the key pair that signed them."""
         self._number = count(1)
 
     def signer(self, private_key: bytes) -> "RecordingSigner":

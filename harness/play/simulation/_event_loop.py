@@ -56,8 +56,9 @@ class EventLoop:
 
     `deliver_all`: also deliver the messages that a released agent would ignore. This takes longer and changes only the
     traces. Every message is also delivered if an agent has quirks, is a foreign agent (a separate program), or has an
-    edited core (`harness.play.core_version`). Such an agent might react to the message. The same is true of a secured
-    mission in which messages can be dropped: a second copy is a replay even if the first one had no effect.
+    edited core (`harness.play.core_version`). Such an agent might react to the message. In a secured mission in which
+    agents can drop messages, every message is delivered, too. For example, an agent drops the second copy of a message
+    as a replay, even if the first copy had no effect.
 
     Receivers share one decoded message. An agent with quirks or an edited core might change this object. In this case,
     each receiver decodes the datagram itself, and traces contain the bytes as they were sent.
@@ -125,7 +126,7 @@ class EventLoop:
         """Messages for a rogue node that may start later in the run, or None if no rogue node can start."""
         self._sought: SoughtRun | None = None
         self._found: int | None = None
-        """The ID of the agent that ran the handler for which the caller waits, or None as long as no agent has."""
+        """The ID of the agent that ran the handler for which the caller waits, or None if no agent has run it yet."""
         self._stopped_within_instant = False
         """True if the last call of `run` stopped at the handler run for which the caller waited. Further inputs of the
         same time may remain.
@@ -308,10 +309,9 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Give an agent the answers that have arrived and that it only counts.
-
-        The loop calls this method before a handler reads the count. If a trace is written, the loop also calls it
-        before other inputs, so that the lines of the trace are in order.
+        """Pass the answers that have arrived, and that the agent only counts, to the agent. The loop calls this method
+        before a handler reads the number of answers. If a trace is written, the loop also calls it before other inputs,
+        so that the lines of the trace are in order.
         """
         agent, state = incarnation.agent, incarnation.state
         if state is None or incarnation.waiting is not None or not self._air.open_queries[number]:
@@ -325,7 +325,9 @@ class EventLoop:
                     self._write_trace(incarnation, at)
 
     def _finish_input(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Complete an input: send the agent's messages, write its trace, and schedule its next timer expiry."""
+        """Complete an input of an agent: send the agent's messages, write the agent's trace, and schedule its next
+        timer expiry.
+        """
         self._send_and_trace(number, incarnation)
         self._schedule_timer(number, incarnation)
 
@@ -368,7 +370,7 @@ class EventLoop:
                 self._rogue.receive_datagram(sealed, self._now)
 
     def _send_stray(self, number: int, incarnation: SimulatedIncarnation, datagram: bytes) -> None:
-        """Send a datagram of the agent that is not a valid message. The rogue node does not receive it."""
+        """Send an invalid datagram of the agent. The rogue node does not receive this datagram."""
         incarnation.bytes_sent += len(datagram)
         self._air.broadcast_stray(self._now, number, datagram)
 
@@ -388,7 +390,7 @@ class EventLoop:
         """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
         delayed answer.
 
-        `soonest` is the same time on the agent's clock, without the lateness of timers.
+        `soonest` is the time on the agent's clock at which this would happen if no timer were late.
         """
         if number not in self._late:
             return incarnation.mission_s(soonest)

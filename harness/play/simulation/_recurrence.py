@@ -10,7 +10,8 @@ these conditions is met:
 - All messages take the same time.
 - Each message and its answers arrive before the next timer expires, and agents only answer or count them.
 
-Otherwise the recurrence proves nothing. The traces show such cycles too (`harness.checker.recurring_cycles`).
+Otherwise the recurrence proves nothing. For runs without a proof, `harness.checker.recurring_cycles` searches for
+cycles in the traces.
 
 The search uses Brent's algorithm. It keeps one state and compares it with the following ones, then keeps a later state
 and compares it with twice as many states. Its memory therefore does not grow with the length of the run.
@@ -78,8 +79,8 @@ class RecurrenceSearch:
         """Return true if the swarm repeats a cycle. Call this only while no message is in transit and at least one
         timer runs.
 
-        - `order`: order of the next timer expiries. For agents with late timers, it also has the order within the
-          agent.
+        - `order`: order of the next timer expiries. For an agent with late timers, it also contains the order of the
+          agent's own timers.
         - `fates`: number of messages that each scripted fate has matched.
         - `fate_at`: time at which a fate last changed the delivery of a message.
         """

@@ -16,8 +16,8 @@ from ucp.store import StoredState
 from ucp.trace import Entry, RecordedBytes
 
 AgentOutput = tuple[int, Message | None, RecordedBytes | None]
-"""A datagram that an agent sent: sequence number, message, and encoded datagram. The last one is None if the message is
-not encoded yet. For data that are no valid message, the sequence number is 0 and the message is None.
+"""A datagram that an agent sent: sequence number, message, and encoded datagram. The encoded datagram is None if the
+message is not encoded yet. For data that are no valid message, the sequence number is 0 and the message is None.
 """
 
 DiskContents = StoredState | tuple[Any]

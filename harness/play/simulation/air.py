@@ -6,15 +6,17 @@ Agents broadcast each message, so each message reaches nearly all agents. Most o
 - A query reaches all agents except those that will still be in a reconcile when it arrives.
 - An answer reaches only the agents that have sent the query, or will have sent it when the answer arrives.
 
-The omission changes the state of no agent, for two reasons. Random draws of the network belong to the broadcast as a
-whole. And the position of an input in the order of inputs (time, rank, receiver) does not depend on other deliveries.
+The omission changes the state of no agent, for two reasons. First, at each broadcast the network draws the random
+numbers for all receivers, including those whose delivery is omitted. Second, the position of an input in the order of
+inputs (time, rank, receiver) does not depend on other deliveries.
 
-Agents only count most answers. The air does not deliver these answers one by one. It stores them, and gives them to the
-agent in order before the agent reads its count (`take_answers`). Only then it computes when they arrived.
+Most answers have no other effect than that the agent counts them. The air does not deliver these answers one by one. It
+stores them. Before the agent reads the number of answers, the air computes when the answers arrived, and passes them to
+the agent in this order (`take_answers`).
 
 If vehicles share a radio channel, every message occupies it, even if it has no effect on any agent. A message arrives
-when its frame ends. Only then it is known which agents receive it, and on which of them it has an effect. The message
-is therefore delivered at once, and no answer is stored.
+when its frame ends. The air cannot know earlier which agents receive the message, and which of them the message
+affects. It therefore delivers the message at the end of the frame, and stores no answers.
 """
 
 from collections import defaultdict
@@ -87,7 +89,7 @@ class _OpenQuery:
     question: Question
     log: _AnswerLog
     since: "ScheduledInput"
-    """The input during which the agent sent the query. Answers count only if they come after it."""
+    """The input during which the agent sent the query. Only answers that arrive after this input count."""
     answered_by: set[int] = field(default_factory=set)
     """Senders whose answers to the query the agent has received."""
     answers_seen: int = 0
@@ -233,7 +235,7 @@ class VirtualAir:
         return list(dict.fromkeys(number for at, _, number in queue if ends.get(number) == at))
 
     def inject(self, at: float, stray: StrayDatagram, numbers: Iterable[int]) -> None:
-        """Schedule the arrival of a stray datagram, which no agent sent as a message, at these agents."""
+        """Schedule the arrival of a stray datagram (a datagram that is not a message of an agent) at these agents."""
         self._rank += 1
         self._quiet_at = max(self._quiet_at, at)
         for number in numbers:

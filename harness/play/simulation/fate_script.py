@@ -19,8 +19,8 @@ NameOf = Callable[[bytes], str | None]
 
 @dataclass(slots=True, eq=False)
 class _ScriptedFate:
-    """A rule of the scenario that decides how single messages are delivered, with two counts: the messages that the
-    rule matched, and the deliveries that it decided.
+    """A rule of the scenario that decides how single messages are delivered. `matches` is the number of messages that
+    the rule matched, and `decided` the number of deliveries that it decided.
     """
 
     index: int
@@ -134,8 +134,8 @@ class FateScript:
         return decided
 
     def settled_counts(self, now: float) -> tuple[int, ...] | None:
-        """Return the number of messages that each rule has matched. Counting stops at the last message that a rule can
-        affect, so that the counts of a swarm in a cycle become constant.
+        """Return the number of messages that each rule has matched. A number does not increase any further after the
+        last message that the rule can affect. The numbers of a swarm in a cycle therefore become constant.
 
         Return None if the effect of a rule still depends on time.
         """
@@ -147,8 +147,9 @@ class FateScript:
         return tuple(min(part.matches, max(part.fate.counts or (0,))) for part in self._parts)
 
     def unmatched(self, waiting: Collection[str]) -> list[str]:
-        """Return a sentence for each rule that had no effect, or only a part of the expected effect. `waiting` contains
-        names of rules. Messages still wait for the message that such a rule should match.
+        """Return a sentence for each rule that had no effect, or only a part of the expected effect. A rule can delay
+        its messages until the message of another, named rule arrives. `waiting` contains the names of rules whose
+        message never arrived, although other messages still wait for it.
         """
         sentences = []
         for part in self._parts:
@@ -177,7 +178,9 @@ class FateScript:
                 yield part
 
     def _count_match(self, part: _ScriptedFate) -> bool:
-        """Count a matching message. Return true if the rule applies to a message with this number."""
+        """Increase the number of messages that the rule has matched. Return true if the rule applies to the message
+        with this number.
+        """
         part.matches += 1
         counts = part.fate.counts
         return counts is None or part.matches in counts

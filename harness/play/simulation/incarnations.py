@@ -39,7 +39,7 @@ class SimulatedIncarnation:
     """The protocol state of the agent, or None if the agent is a separate program, whose state the harness cannot read.
     """
     secured: KeyedAgent | None = None
-    """The same agent, with its interface for keys, or None if the agent has no keys."""
+    """The object `agent` with the type `KeyedAgent`, or None if the agent has no keys."""
     rebooted: bool = False
     """True if the agent started with the data on its disk, after a power failure."""
     deadline: float | None = None
@@ -53,7 +53,8 @@ class SimulatedIncarnation:
     """Number of handler runs, which are counted only if a trace is written."""
     ended_at: float | None = None
     completed: int = 0
-    """Number of blocks that the agent had completed after its last input, if it runs in this process."""
+    """Number of blocks that the agent had completed after its last input. Only for an agent that runs in this process.
+    """
     disk: StoredState | None = None
     """The content of the agent's disk after its last input. Only for an agent that runs in this process and may reboot
     with its disk.
@@ -70,8 +71,8 @@ class SimulatedIncarnation:
         return self.agent.status().top_chain_hash if self.state is None else self.state.chain.top_chain_hash.hex()
 
     def drop_unfinished_input(self) -> None:
-        """Drop the blocks that the agent completed in an input whose handlers did not finish. No record contains these
-        blocks.
+        """If the handlers of an input did not finish, forget the blocks that the agent completed during this input,
+        because no record contains these blocks.
         """
         if self.state is not None:
             del self.state.completed[self.completed :]

@@ -16,7 +16,7 @@ class RecordedSeals:
     """
 
     sealed: Mapping[bytes, bytes]
-    """The encrypted event data of each block, by the last event of the block, encoded as bytes."""
+    """Last event of a block, encoded as bytes -> the encrypted event data of the block."""
 
     def __call__(self, event_data: bytes, timestamp_us: int) -> bytes:
         try:

@@ -1,4 +1,4 @@
-"""Write the files of a simulated run, and define the interface of an object that records its events."""
+"""Write the files of a simulated run, and define the interface of an object that records the events of the run."""
 
 import contextlib
 import errno

@@ -262,7 +262,7 @@ class Simulation(EventLoop):
         return False
 
     def _is_settled(self) -> bool:
-        """Return true if all agents are idle. If agents hang instead, record them in `played`.
+        """Return true if all agents are idle. If some agents can never become idle, record them in `played`.
 
         Call this only if no message is in transit and no timer runs.
         """
@@ -479,7 +479,7 @@ class Simulation(EventLoop):
 
     def _handler_runs(self, incarnation: SimulatedIncarnation, status: AgentStatus | None) -> HandlerRuns | None:
         """Return the number of handler runs of the agent, with the time of the count. A foreign agent counts its
-        handler runs itself. Return None if its status is unknown.
+        handler runs itself. Return None if the status of the agent is unknown.
         """
         if status is None:
             return None
@@ -587,8 +587,8 @@ def _rounded(seconds: float | None) -> float | None:
 
 
 def _disconnected_until(at_s: float, network: Sequence[NetworkState]) -> list[NetworkState]:
-    """Return the records of network changes. While scripted deliveries are active (until `at_s`), the records say that
-    the network is not fully connected.
+    """Return a corrected copy of these records of network changes. Scripted deliveries end at `at_s`. Up to this time,
+    the copy states that the network is not fully connected.
     """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [state.model_copy(update={"fully_connected": False}) for state in network if state.at_s < since]

@@ -1,4 +1,4 @@
-"""Run a foreign agent (a separate program) in virtual time, from one start to its end. This object has the same
+"""Run a foreign agent (a separate program) in virtual time, from a start to the next end. This object has the same
 interface as an agent in this process.
 
 The harness writes each input to the program as a line. The answer contains the datagrams that the agent sends, the
@@ -81,7 +81,7 @@ class IncarnationRecord:
 
 
 class ForeignAgent:
-    """A foreign agent (a separate program) from one start to its end. It implements the interface `VirtualAgent`.
+    """A foreign agent (a separate program) from a start to the next end. It implements the interface `VirtualAgent`.
 
     The methods raise AgentFailedError or AgentLacksError. After a failure, each input raises the same error again.
     """

@@ -21,7 +21,7 @@ _DIGITS = re.compile("[0-9a-fA-F]{8,}")
 class SecuredForeignAgent(ForeignAgent):
     """A foreign agent with the keys in `bundle`. The other arguments are those of `ForeignAgent`.
 
-    Error messages do not contain its secrets.
+    Error messages do not contain the secrets of the agent.
     """
 
     def __init__(self, bundle: Bundle, *arguments: Any, **options: Any) -> None:

@@ -120,8 +120,8 @@ class ForeignSwarm:
         self._playing.clear()
 
     def _mission(self, agent_id: int, incarnation: int) -> dict[str, Any]:
-        """Return the mission file of an agent. Where virtual time requires it, the file differs from the mission file
-        of a real process.
+        """Return the mission file of an agent. Some values differ from the mission file of a real process, because
+        virtual time requires other values.
         """
         mission = mission_file(
             agent_id,

@@ -34,8 +34,8 @@ class NondeterminismError(HarnessError):
 class DeterminismCheck:
     """A check whether recorded agents are deterministic.
 
-    It starts one process for each command, so close it after use. If `patient` is true, the check first waits for the
-    next second of the clock, because an agent may read a clock in whole seconds.
+    The object starts one process for each command, so the caller must call `close` after use. If `patient` is true, the
+    check first waits for the next second of the clock, because an agent may read a clock in whole seconds.
     """
 
     def __init__(self, *, patient: bool) -> None:

@@ -217,7 +217,9 @@ class LineProgram:
         return None
 
     def kill(self) -> None:
-        """Kill the program with SIGKILL, and the other processes of its process group, such as those of a script."""
+        """Kill the program and all other processes of its process group with SIGKILL. If the program is a script, these
+        include the processes that the script started.
+        """
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
