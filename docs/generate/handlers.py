@@ -22,16 +22,18 @@ INTRODUCTION = """\
 # The 20 event handlers
 
 An event handler is the code that an agent runs for one kind of event. Chapter 3 of the thesis defines 20 handlers,
-Algorithms 1-20. They are in [commit.py](../commit.py) and [reconcile.py](../reconcile.py).
-[The agent contract](CONTRACT.md#the-20-algorithms) lists them in pseudo-code, and [BRANCHES.md](BRANCHES.md) lists
-their branches with the conditions. [How UCP works](../../docs/explanation/protocol.md) explains the protocol.
+Algorithms 1-20. They are in [commit.py](../commit.py) and [reconcile.py](../reconcile.py). The page ["The agent
+contract"](CONTRACT.md#the-20-algorithms) lists the handlers in pseudo-code. The page [BRANCHES.md](BRANCHES.md) lists
+the branches of each handler with their conditions. The page ["How UCP works"](../../docs/explanation/protocol.md)
+explains the protocol.
 
 Each handler declares the messages that it sends, the timers that it starts, and the local events that it triggers.
 [core.py](../core.py) rejects any message, timer or local event that the handler does not declare. The tables in
 [agent.py](../agent.py) define which handler runs when a message arrives, a timer expires, or a local event occurs.
 `python -m docs.generate.handlers` generates this page from these declarations and tables.
 
-The diagram has three kinds of arrows. Each arrow leads from a handler to a handler that it causes:
+The diagram has three kinds of arrows. Each arrow leads from a handler to a second handler. The first handler causes the
+second handler to run:
 
 | arrow | cause | where and when the second handler runs |
 |---|---|---|
@@ -39,8 +41,8 @@ The diagram has three kinds of arrows. Each arrow leads from a handler to a hand
 | thin | timer | in the same agent, when the timer expires |
 | dotted | message | in each agent that receives the message |
 
-Two causes are not in the diagram. The operator can trigger Reconcile Begin with a command. An agent that continues
-from its store starts with Reconcile Finalize.
+Two causes are not in the diagram. The operator can trigger the handler "Reconcile Begin" with a command. An agent that
+continues from its store starts with the handler "Reconcile Finalize".
 
 """
 
