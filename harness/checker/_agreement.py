@@ -36,8 +36,8 @@ MAX_REASONS = 3
 
 
 def explain_unknown(evidence: Evidence) -> str | None:
-    """Return the reason why the exported chains do not show the whole system in an idle state. Return None if the
-    chains show such a state.
+    """Return the reason why the exported chains are incomplete or not final: an export is missing, or an agent was not
+    idle when it wrote its export. Return None if there is no such reason.
     """
     if not evidence.exports:
         return "the run has no chain exports"

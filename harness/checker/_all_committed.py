@@ -19,8 +19,8 @@ def check(evidence: Evidence) -> Judgement:
     """Return the verdict on characteristic 5. Blocks that only killed or switched-off agents held do not count (Section
     3.3).
 
-    The verdict is `not applicable` if an export is missing, if an agent was not idle, or if the agents that lack a
-    block had no chance to get it.
+    The verdict is `not applicable` in three cases: an export is missing, an agent was not idle, or the agents that lack
+    a block had no chance to receive this block.
     """
     if never_agrees := check_endless_cycle(NAME, evidence):
         return never_agrees
@@ -68,8 +68,8 @@ def check(evidence: Evidence) -> Judgement:
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
     """Return the number of lost blocks, and the hashes of all other completed blocks.
 
-    A block counts as lost if no present agent holds it, and if the agent that completed it was killed (Section 3.3 of
-    the thesis), restarted or switched off.
+    A block counts as lost under two conditions: no present agent holds the block, and the agent that completed the
+    block was killed (Section 3.3 of the thesis), restarted or switched off.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

@@ -1,8 +1,8 @@
 """Check characteristic 1: agents work without a coordinator, and an agent runs code only in reaction to an event.
 
 Every handler run has a local trigger, or a message that its sender really sent. Every vote ends with its own timer, so
-no vote waits for another agent. Only traces show this, and only if the checker knows the names of handlers and messages
-in them.
+no vote waits for another agent. The check needs traces, and it must know the names of the handlers and messages in
+these traces.
 """
 
 from typing import Any

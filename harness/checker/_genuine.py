@@ -16,8 +16,8 @@ NAME = "genuine"
 _Content = tuple[int, int, str, str]
 """The content of an exported block: agent, timestamp, event data and block hash."""
 _Link = tuple[str, str, str | None]
-"""Chain hash of the block below, block hash, and chain hash of the block itself. The last hash must follow from the
-first two.
+"""Three hashes: the chain hash of the previous block, the block hash, and the chain hash of the block. The third hash
+must follow from the first two (eq. 3.2).
 """
 
 
@@ -51,10 +51,10 @@ def check(evidence: Evidence) -> Judgement:
     """Recompute the hashes in all exports, and compare the exported blocks with the blocks that each agent completed.
     Return the verdict on characteristic 4.
 
-    In a secured mission, agents sign their blocks and exports. The signatures then decide, so the check does not need
-    the records of the agent that a block names. A signed block that this agent did not complete is still not genuine,
-    because an attacker may have the agent's key. Each export has a signed head, which covers the order and the number
-    of its blocks.
+    In a secured mission, agents sign their blocks and exports. The signatures then prove who completed a block, so the
+    check does not need the records of the block's author. A signed block that its author did not complete is still not
+    genuine, because an attacker may have the author's key. Each export has a signed head, which covers the order and
+    the number of its blocks.
 
     The verdict is `not applicable` without an export, or if the completed blocks of an agent are unknown. In a secured
     mission it is also `not applicable` without an anchor, a trusted copy of the public keys.

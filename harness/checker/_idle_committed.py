@@ -7,10 +7,9 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Check the exported state of each agent, and its state after each handler run. Return the verdict on
-    characteristic 2.
-
-    The verdict is `not applicable` if an agent left no export, or was not idle when it wrote its export.
+    """Check two states of each agent: the exported state, and the state after each handler run. Return the verdict on
+    characteristic 2. The verdict is `not applicable` if an agent left no export, or was not idle when it wrote its
+    export.
     """
     findings = [*_check_exports(evidence), *_check_traces(evidence)]
     if findings:

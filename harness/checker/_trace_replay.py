@@ -45,7 +45,7 @@ class ReplayedIncarnation:
 
     trace: Trace
     number: int
-    """Number of earlier starts of the agent in this trace. It is 0 up to the first restart."""
+    """Number of restarts of the agent before this incarnation. It is 0 for the first incarnation."""
     runs: list[HandlerRun]
     chain: list[str] = field(default_factory=list)
     """The chain. The oldest block is first."""

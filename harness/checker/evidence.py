@@ -48,8 +48,8 @@ Derived = TypeVar("Derived")
 
 Sending = tuple[tuple[float, SentMessage], ...]
 """The messages of one agent that have the same type and sequence number, each with the mission second at which the
-agent sent it. There is more than one only if the agent restarted, because a restarted agent numbers its messages from 0
-again.
+agent sent the message. A second message exists only if the agent restarted, because a restarted agent numbers its
+messages from 0 again.
 """
 Sendings = dict[Any, dict[Any, Sending]]
 """The messages that one agent sent: message type -> sequence number -> messages."""
@@ -146,7 +146,7 @@ class Evidence:
     """The lines of `network.jsonl`. None if the file is missing."""
     captures: Captures | None = None
     lag: MeasuredLag | None = None
-    """The measured delays of the machine and of agents. None if the run has no such measurement."""
+    """The measured delays of the machine and of the agents' processes. None if the run has no such measurement."""
     keys: TrustedKeys | None = None
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[UnverifiedSignature], bool] | None" = None
@@ -164,8 +164,8 @@ class Evidence:
     loss rates of the changed links. The first entry contains all links.
     """
     delivers_all: bool = False
-    """True if the simulation delivered every message that was not lost. It is false if the simulation skipped messages
-    that the released agent core ignores, which saves time.
+    """True if the simulation delivered every message that was not lost. False if the simulation saved time and did not
+    deliver messages that the released agent core ignores.
     """
     from_field: bool = False
     """True for files without the run record run.json, for example from a real flight. Without the counters in run.json,
@@ -174,7 +174,9 @@ class Evidence:
     steps: Judgement | None = None
     """The judgement on the steps, if the checker has already made it. None otherwise."""
     stores: dict[int, Path] = field(default_factory=dict)
-    """Agent ID -> path of the state that the agent last stored on disk. Agents without stored state are missing."""
+    """Agent ID -> path of the file in which the agent last stored its state. Agents that stored no state are
+    missing.
+    """
     channel: list[ChannelLine] | None = None
     """The log of the radio channel that all vehicles share. None if the run has no such log."""
     report_progress: ReportProgress = lambda step: None
@@ -195,11 +197,11 @@ class Evidence:
 
     @cached_property
     def sent_without_trace(self) -> bool:
-        """True if agents of a secured mission may have sent datagrams that no trace contains. These datagrams are
-        revocations of keys, challenges and echoes. Challenges and echoes show a restarted agent that its peers are
-        active.
+        """True if agents of a secured mission may have sent datagrams that no trace contains. Such a datagram is a
+        revocation of a key, a challenge or an echo. A restarted agent uses challenges and echoes to confirm that its
+        peers are active.
 
-        Agents send challenges and echoes only after a restart, or after a datagram that needs one.
+        Agents send challenges and echoes only after a restart, or after a datagram that requires them.
         """
         return any(
             (trace.header.secured and trace.starts) or any(_needs_control_datagrams(aside) for _, aside in trace.asides)
@@ -220,7 +222,7 @@ class Evidence:
     @cached_property
     def unknown(self) -> dict[int, UnknownNames]:
         """Agent ID -> the names in the agent's trace that the agent contract does not define, such as names of
-        handlers. Agents whose names are all defined are missing.
+        handlers. The dictionary contains only agents with at least one undefined name.
         """
         words = {agent_id: unknown_names(trace.runs) for agent_id, trace in self.traces.items()}
         return {agent_id: unknown for agent_id, unknown in words.items() if unknown}
@@ -332,8 +334,8 @@ class Evidence:
 
     @cached_property
     def switched_off(self) -> dict[int, float]:
-        """Agent ID -> the mission second at which the agent was switched off. Agents that ran until the end are
-        missing.
+        """Agent ID -> the mission second at which the agent was switched off. The dictionary contains only switched-off
+        agents.
         """
         return self.record.switched_off if self.record else {}
 
@@ -499,8 +501,8 @@ def gather(archive: RunArchive) -> Evidence:
 
 
 def _marked(trace: Trace, record: JudgedRecord | None) -> Trace:
-    """Return the trace of an agent on another computer, with a problem added if the end of an incarnation is missing
-    from the trace. Return all other traces unchanged.
+    """Return the trace unchanged, unless the agent ran on another computer and the end of an incarnation is missing
+    from the trace. In this case, return a copy of the trace that names the problem.
     """
     remote = record.remote.get(str(trace.header.agent_id)) if record else None
     if remote is None or not remote.incomplete or trace.problem:

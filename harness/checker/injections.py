@@ -1,9 +1,10 @@
 """Count how the agents handled injected messages. The sources are the injection log and the traces.
 
-The rogue node, a simulated attacker, either forges messages or sends copies of real messages again. A forged message
-has a sequence number that no agent uses. Each handler run with this number therefore belongs to the rogue node. A copy
-is equal to its original, so a trace cannot distinguish them. If an agent handled such a message several times, the
-check assigns the last handler runs to the copies. It assigns at most one run to each copy that was sent before the run.
+The rogue node, a simulated attacker, either forges messages or sends copies of real messages. A forged message has a
+sequence number that no agent uses. Each handler run with this number therefore belongs to the rogue node. A copy is
+equal to its original, so a trace cannot distinguish copy and original. If an agent handled copy and original, the check
+assigns the last handler runs to the copies. Each copy gets at most one handler run, which must be later than the
+sending of the copy.
 
 An agent of a secured mission handles each datagram only once, and drops altered datagrams. Corrupted messages therefore
 count as not handled. A copy that is sent immediately cannot be distinguished from the original. If an agent handles a
@@ -65,8 +66,8 @@ class _InjectionTally:
     handled: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     changed: Counter[str] = field(default_factory=Counter)
     reached: dict[str, set[tuple[_Key, int]]] = field(default_factory=lambda: defaultdict(set))
-    """Message type -> the messages that at least one agent handled. The number with each message distinguishes its
-    copies.
+    """Message type -> the messages that at least one agent handled. Each message has a number that distinguishes its
+    injected copies.
     """
 
 
@@ -156,8 +157,9 @@ def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[H
 def _pair_with_copies(
     copies: Sequence[tuple[float, int]] | None, key: _Key, runs: list[HandlerRun]
 ) -> Iterator[tuple[int, int, HandlerRun]]:
-    """Assign the handler runs for a message to the injected copies of the message, the last run to the last copy. Yield
-    the number of the injection, the index of the copy, and the handler run.
+    """Assign the handler runs for a message to the injected copies of the message. The last run is assigned to the last
+    copy, the run before it to the copy before it, and so on. Yield the number of the injection, the index of the copy,
+    and the handler run.
     """
     forged = injection_of(key[1])
     if copies is None and forged is not None:

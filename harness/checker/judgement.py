@@ -8,7 +8,9 @@ from dataclasses import asdict, dataclass, field
 from harness.scenario.verdict_names import Kind, Verdict, kind_of
 
 MAX_EVIDENCE = 50
-"""Maximum number of findings that a judgement lists. Its reason contains the total number."""
+"""Maximum number of findings that a judgement lists. The reason of the judgement contains the total number of
+findings.
+"""
 
 
 @dataclass(frozen=True)

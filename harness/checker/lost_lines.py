@@ -222,10 +222,10 @@ def was_running(trace: Trace, timestamp_us: int) -> bool:
 
 
 def may_be_of_missing_incarnation(evidence: Evidence, block: ExportedBlock) -> bool:
-    """Return true if the author of the block may have completed it between two restarts that no record covers.
+    """Return true if no record covers the time at which the author of the block may have completed the block.
 
-    Only run.json lists all restarts. Without it, the trace of an agent shows the times at which the agent ran, and an
-    export lists only the blocks that the agent completed since its last restart.
+    Only run.json lists all restarts of an agent. Without run.json, the trace of an agent shows the times at which the
+    agent ran, and an export lists only the blocks that the agent completed since its last restart.
     """
     if evidence.record is not None:
         return False

@@ -127,7 +127,9 @@ def spread_of(trace: Trace) -> float:
 
 
 def sent_at(run: HandlerRun, message: SentMessage, spread_s: float) -> float:
-    """Return the mission second at which the agent sent this message, which it produced in this handler run."""
+    """Return the mission second at which the agent sent a message. `run` is the handler run that produced the
+    message.
+    """
     if not spread_s or message.message not in ANSWERS or message.datagram is None:
         return run.t
     try:

@@ -68,10 +68,10 @@ def are_signed(exports: Iterable[Export]) -> bool:
 
 
 def vouch(exports: Iterable[Export], keys: TrustedKeys | None) -> tuple[list[str], str | None]:
-    """Return a sentence for each export with a wrong signature, and the reason why correct signatures prove nothing.
+    """Return two results: a list with a sentence for each export with a wrong signature, and the reason why correct
+    signatures prove nothing. The reason is None if correct signatures prove that the exports are genuine.
 
-    The reason is None if correct signatures prove that the exports are genuine. Without `keys`, the exports may be
-    unsigned. They then count as exports of a mission without keys.
+    Without `keys`, the exports may be unsigned. They then count as exports of a mission without keys.
     """
     exports = list(exports)
     if keys is None and not are_signed(exports):

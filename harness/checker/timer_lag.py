@@ -17,7 +17,7 @@ class TimerLag:
     """The lateness of vote timers."""
 
     late_s: float
-    """Lateness in mission seconds. Only one in twenty vote timers was later."""
+    """Lateness in mission seconds that 19 of 20 vote timers did not exceed."""
     asked_s: float
     """Requested duration of a vote timer in mission seconds."""
 
@@ -31,7 +31,8 @@ def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerL
     """Return the lateness of the vote timers of all agents. Votes that a reconcile interrupted do not count. Return
     None for fewer than `ENOUGH` votes.
 
-    If `lag` is given, only the part of the lateness counts that the measured delays of the machine explain.
+    `lag` contains the measured delays of the machine. If it is given, only the lateness that these delays explain
+    counts.
     """
     late: list[float] = []
     asked_s = 0.0

@@ -54,8 +54,9 @@ COMPARISONS: tuple[Callable[[Evidence], Iterator[Contradiction]], ...] = (
 )
 
 NEEDS_ALL_LINES = (_heard_vs_sent.compare,)
-"""Comparisons that need complete traces. A restarted agent numbers its messages from 0 again, and the trace of its
-first incarnation may be missing.
+"""Comparisons that are omitted for records from the field, because they need complete traces. In the field, the trace
+of an agent's first incarnation may be missing. A restarted agent numbers its messages from 0 again, so the comparison
+would take messages of different incarnations for the same message.
 """
 
 

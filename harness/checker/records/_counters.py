@@ -219,8 +219,9 @@ def compare_completed_blocks(evidence: Evidence) -> Iterator[Contradiction]:
 def _over_brown_outs(
     evidence: Evidence, agent_id: int, incarnations: list[ReplayedIncarnation]
 ) -> Iterator[Contradiction]:
-    """Yield a contradiction for each restart after a power failure for which the agent's disk lacked completed blocks.
-    The disk may contain one additional block, because the last trace line before the power failure may be missing.
+    """Compare the completed blocks before and after each restart after a power failure. Yield a contradiction if the
+    agent's disk lacked completed blocks. The disk may contain one additional block, because the last trace line before
+    the power failure may be missing.
     """
     for before, after in pairwise(incarnations):
         if not after.runs or not isinstance(after.runs[0].trigger, BootTrigger):

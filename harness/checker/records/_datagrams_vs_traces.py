@@ -1,13 +1,13 @@
 """Compare the number of datagrams that the kernel delivered to an agent with the datagrams in traces.
 
 A trace has a line for each datagram that its agent handled or dropped. The agent also reads its own broadcasts, which
-it ignores. If the agent read more datagrams than these, its trace is incomplete. An agent may end before it handles a
-datagram that it has just read, so datagrams that arrived shortly before the end may be missing. An agent may also use
-other sockets, for example between its processes, so only broadcasts count.
+it ignores. If the agent read any other datagram, its trace is incomplete. There are two exceptions. An agent may end
+before it handles a datagram that it has just read, so datagrams that arrived shortly before the end may be missing. An
+agent may also use other sockets, for example between its processes, so only broadcasts count.
 
-An agent that stops reading its socket also has a trace that looks complete. The module therefore also uses the kernel's
-count of broadcasts that arrived at each vehicle. A broadcast that neither the agent read nor the kernel discarded is
-still in the socket.
+If an agent stops reading its socket, its trace looks complete, although it did not handle all datagrams. The module
+therefore also uses the kernel's count of broadcasts that arrived at each vehicle. A broadcast that neither the agent
+read nor the kernel discarded is still in the socket.
 """
 
 from bisect import bisect_left, bisect_right
@@ -20,11 +20,13 @@ from harness.checker.records.contradiction import Contradiction, of_agent
 from ucp.trigger import MessageTrigger
 
 UNDER_WAY_WALL_S = 0.25
-"""Seconds of wall time before an agent stops. The agent may not have handled a datagram that it read in this
-interval.
+"""Maximum number of seconds of wall time from reading a datagram until handling it. If the agent stops within this
+time, it may have read the datagram without handling it.
 """
 UNREAD_WALL_S = 1.0
-"""Seconds of wall time before an agent stops. The agent may not have read a datagram that arrived in this interval."""
+"""Maximum number of seconds of wall time from the arrival of a datagram until the agent reads it. If the agent stops
+within this time, the datagram may stay unread.
+"""
 
 
 def find_unrecorded(evidence: Evidence) -> Iterator[Contradiction]:
@@ -78,8 +80,9 @@ def _sentence(counted: DatagramsRead, unrecorded: int, handled: int, dropped: in
 
 
 def _at_the_end(evidence: Evidence, agent_id: int, trace: Trace, wall_s: float) -> int:
-    """Return the maximum number of datagrams that were in transit to the agent at its stops, added over all stops.
-    `wall_s` is the maximum time of transit in seconds of wall time.
+    """Return the maximum number of datagrams that an agent may have left unhandled or unread because it stopped. The
+    result is a sum over all stops of the agent. It counts the datagrams that any agent sent at most `wall_s` seconds of
+    wall time before or after a stop, and one more for each stop.
     """
     before_s = _mission_s(trace, wall_s)
     ends = _killed_at(evidence, agent_id)

@@ -1,8 +1,9 @@
 """Compare the state that an agent stored on its disk with the state that it exported.
 
-An agent writes each change to its store before any other agent can observe the change. At its end, the store therefore
-contains the blocks of the export. Stores in a format other than `ucp-store/1` belong to agents of other authors and are
-not compared. The store of an agent with a full disk is not compared either, because it ends early.
+An agent writes each change to its store before any other agent can observe the change. When the agent ends, the store
+therefore contains the blocks of the export. Two kinds of stores are not compared: stores in a format other than
+`ucp-store/1`, which belong to agents of other authors, and stores on a full disk, because the last changes are missing
+there.
 """
 
 from collections.abc import Iterator

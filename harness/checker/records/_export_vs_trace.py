@@ -122,7 +122,7 @@ def _value(value: object) -> str:
 
 def _contents(agent_id: int, export: Export, incarnation: ReplayedIncarnation) -> Iterator[Contradiction]:
     """Yield the differences between the blocks of an export and the blocks of the trace. Call this function only if the
-    lengths and the top chain hash are equal.
+    export and the trace have equal lengths and equal top chain hashes.
     """
     if incarnation.wrong_lengths or incarnation.wrong_tops or incarnation.impossible or incarnation.unknown:
         return

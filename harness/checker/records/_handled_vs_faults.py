@@ -5,9 +5,10 @@ sender sends a message, the receiver does not handle this message. The time of s
 are already in transit still arrive.
 
 The harness records a stop after the agent has stopped, and a start before the agent runs again. `CLOCK_SLACK_WALL_S`
-therefore covers only the difference between two readings of the machine's clock. Links are different: a busy machine
-may change the network conditions between the time of a trace line and its datagram. A link therefore counts as cut only
-if it was cut for the slack of processes before and after the time of sending.
+therefore covers only the difference between two readings of the machine's clock. Links are different: on a busy
+machine, the network conditions may change between the time of a trace line and the sending of its datagram. A message
+therefore counts as sent over a cut link only if the link was cut during the whole tolerance interval around the time of
+sending.
 """
 
 from bisect import bisect_right

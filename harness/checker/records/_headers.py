@@ -2,7 +2,8 @@
 the handler's name.
 
 With the key `stagger`, a scenario gives each agent a different addition to its timers. The comparison therefore
-subtracts this addition. The clock of another computer shows another time at mission second 0, which run.json contains.
+subtracts this addition. The clocks of other computers differ at mission second 0. run.json contains the time that each
+of these clocks showed at mission second 0.
 """
 
 from collections.abc import Iterator

@@ -88,8 +88,8 @@ def _is_unchanged(datagram: RecordedBytes, sent: Sending) -> bool:
 
 
 def _another_block(run: HandlerRun, trigger: MessageTrigger, sent: Sending) -> str | None:
-    """Return the block that the agent added to its chain if the handled message carried a different block. Return None
-    if the message carried this block or carries no block.
+    """Return the block that the agent added to its chain if the handled message did not carry this block. Return None
+    if the message carried the added block, or if messages of this type carry no block.
     """
     if trigger.message not in CARRY_A_BLOCK:
         return None

@@ -1,26 +1,28 @@
-"""Compare the share of lost messages with the loss rate that the network was set to.
+"""Compare the share of lost messages with the loss rate that the scenario set for the network.
 
-Each receiver of a message loses it independently, with a known probability. The number of lost messages is therefore a
-sum of independent draws. Hoeffding's bound (1963, Theorem 1) limits the probability of an unusual share. If n draws
-have the mean q, their share is a or more, for a > q, with a probability of at most exp(-n KL(a, q)). KL is the relative
-entropy of two draws. The same bound holds for shares below the mean. A share contradicts the records only if this
-probability is below `MAX_CHANCE`, so chance practically never causes a contradiction.
+Each receiver of a message loses the message independently, with a known probability. The number of lost messages is
+therefore a sum of independent draws. Hoeffding's bound (1963, Theorem 1) limits the probability of an unusual share.
+Let q be the mean probability of n draws, and let a be greater than q. Then the share of lost messages is at least a
+with a probability of at most exp(-n KL(a, q)). KL is the relative entropy of two draws. The same bound holds for shares
+below the mean. A share contradicts the records only if this probability is below `MAX_CHANCE`, so chance practically
+never causes a contradiction.
 
-Only messages count that a correct agent handles if they arrive:
+The comparison counts only messages that a correct agent handles if they arrive:
 
-- With processes and containers: all messages. These agents may handle fewer messages than arrive, because they were
-  stopped or a socket was full. Handled messages therefore contradict the loss rate only if their number is too high. If
-  the engine counts packets, its counts can also be too low.
-- In virtual time: messages of three types, if the agent runs and does not reconcile. Virtual time does not deliver
-  other messages without effect. It delivers all messages if the core was edited. Then all messages count while the
-  agent runs.
+- With processes and containers, it counts all messages. An agent may handle fewer messages than arrive, because it was
+  stopped or its socket was full. The number of handled messages therefore contradicts the loss rate only if it is too
+  high. If the engine counts packets, the number of counted packets can also be too low.
+- In virtual time, it counts messages of three types, while the agent runs and does not reconcile. The simulation does
+  not deliver messages of other types if they have no effect. If the core was edited or is a variant, the simulation
+  delivers all messages. The comparison then counts all messages while the agent runs.
 
-If the network duplicates messages, a message counts as handled if one of its copies was. A message without a second
-copy is lost with the loss rate. A message that is both lost and duplicated arrives once. The probability that no copy
-arrives is therefore the loss rate times the probability that there is no second copy.
+If the network duplicates messages, a message counts as handled if the agent handled one of its copies. A message
+without a second copy is lost with the loss rate. A message that is both lost and duplicated arrives once. The
+probability that no copy arrives is therefore the loss rate times the probability that there is no second copy.
 
-A dropped datagram arrived. In a secured mission, for example, a restarted agent drops messages of agents that it has
-not yet confirmed. If an agent handled too few messages, its dropped datagrams therefore count as handled.
+A dropped datagram arrived, but the agent did not handle it. For example, a restarted agent of a secured mission drops
+messages of agents that it has not yet confirmed. If an agent handled too few messages, its dropped datagrams therefore
+count as handled.
 """
 
 from bisect import bisect_right
@@ -63,12 +65,12 @@ class _ExpectedDeliveries:
     messages: int = 0
     """Number of messages that the receiver would handle in a network without loss."""
     least: float = 0.0
-    """Sum of the loss probabilities (0 to 1) of these messages. For each message, it contains the smallest probability
-    that the records allow.
+    """Lower bound of the number of lost messages: the sum of the smallest loss probabilities (0 to 1) that the records
+    allow for these messages.
     """
     most: float = 0.0
-    """Sum of the loss probabilities (0 to 1) of these messages. For each message, it contains the largest probability
-    that the records allow.
+    """Upper bound of the number of lost messages: the sum of the largest loss probabilities (0 to 1) that the records
+    allow for these messages.
     """
     handled: int = 0
     """Number of these messages that the receiver handled."""
@@ -136,9 +138,8 @@ class _LossHistory:
         return found
 
     def _around(self, values: list[float], first: int, end: int) -> list[float]:
-        """Return the values that may have been in effect at a time. `first` is the number of values that took effect
-        before the tolerance interval around this time. `end` is the number of values that took effect until the end of
-        the interval.
+        """Return the values that may have been in effect at a time with a tolerance. `values` is in order of time.
+        `first` values took effect before the tolerance interval, and `end` values before the end of the interval.
         """
         first = max(0, first - 1)
         return values[first : max(first + 1, end)]
@@ -195,8 +196,8 @@ def _is_impossible_at(seen: _ExpectedDeliveries, sides: tuple[bool, ...]) -> boo
 
 
 def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) -> dict[int, _ExpectedDeliveries]:
-    """Return for each receiver the messages that it would handle in a network without loss, with the probabilities that
-    they are lost.
+    """Return, for each receiver, the messages that it would handle in a network without loss, together with the
+    probability of losing each message.
 
     `over_cuts` is the smallest and the largest loss probability to use for messages over a cut link. If it is None,
     such messages are lost with probability 1.
@@ -237,11 +238,11 @@ def _expected(evidence: Evidence, over_cuts: tuple[float, float] | None = None) 
 
 
 def _sent(evidence: Evidence, counted: frozenset[str] | None, duplicates: bool) -> dict[int, list[_SentMessage]]:
-    """Return the messages that each agent sent, if their type is in `counted`. If `counted` is None, return messages of
-    all types.
+    """Return the messages that each agent sent. The result contains only messages of the types in `counted`, or of all
+    types if `counted` is None.
 
-    If the network duplicates messages, the result omits each message that an agent sent both before and after a restart
-    under the same sequence number. A receiver cannot distinguish the copies of these messages.
+    In a network that duplicates messages, a receiver cannot distinguish copies of two messages with the same type and
+    sequence number. An agent sends two such messages only if it restarts. The result then contains neither of them.
     """
     return {
         sender: [
@@ -257,8 +258,8 @@ def _sent(evidence: Evidence, counted: frozenset[str] | None, duplicates: bool) 
 
 
 class _ReadyTimes:
-    """The times at which an agent in the simulation handles every message that arrives. At other times, the agent is
-    stopped, or it reconciles and ignores messages. `counted` contains the message types to which this applies.
+    """The times at which a simulated agent handles every arriving message whose type is in `counted`. At other times,
+    the agent is stopped, or it reconciles and ignores messages.
     """
 
     def __init__(self, evidence: Evidence, agent_id: int) -> None:

@@ -1,8 +1,9 @@
 """Compare the scenario with the changes, agents and duration that run.json records.
 
-The scenario fixes all network changes, faults and injections before the run. If run.json lacks one of them or has an
-additional one, it belongs to a different run. Three kinds of changes are not in the scenario: changes because vehicles
-move, the end of the section `fates`, and the lossless network during the final reconcile.
+The scenario fixes all network changes, faults and injections before the run. If run.json lacks one of these entries or
+has an additional one, run.json belongs to a different run. Three kinds of changes are in run.json but not in the
+scenario: changes because vehicles move, the end of the section `fates`, and the lossless network during the final
+reconcile.
 """
 
 from collections.abc import Iterator

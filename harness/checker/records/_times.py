@@ -79,7 +79,7 @@ def _compare_export(
 
 
 def _has_recorded_events(evidence: Evidence) -> bool:
-    """Return true if the events of the scenario keep the timestamps of a recorded run."""
+    """Return true if the events have the timestamps of an earlier, recorded run, and not the times of their logging."""
     return evidence.scenario is None or any(event.timestamp_us is not None for event in evidence.scenario.events.script)
 
 

@@ -31,8 +31,8 @@ NAME = "every step"
 
 
 def first_cause(judgement: Judgement | None) -> str | None:
-    """Return the subject of the verdict `deviates`: the handler of the first step that deviates, or the edited files of
-    the code that judge and agents share. Return None for other verdicts, and if neither is known.
+    """Return the cause of the verdict `deviates`: the name of the first handler that deviates, or the names of the
+    edited files that the judge and the agents share. Return None for any other verdict, or if the cause is unknown.
     """
     if judgement is None or judgement.verdict != "deviates":
         return None
@@ -57,7 +57,7 @@ def check(evidence: Evidence) -> Judgement:
 
 
 def _compare(evidence: Evidence) -> Judgement:
-    """Return the verdict on all steps, if the shared code is intact."""
+    """Return the verdict on all steps. The caller has checked that the shared code is intact."""
     blocks = BlockIndex(block for export in evidence.exports.values() for block in export.blocks())
     deviations: list[StepDeviation] = []
     timers = JudgedTimers()

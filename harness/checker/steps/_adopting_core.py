@@ -132,8 +132,8 @@ class AdoptingCore(_Core):
         return [SentMessage.of(self.agent_id, sequence, message) for sequence, message in self.outbox]
 
     def go_along(self, run: HandlerRun) -> None:
-        """Select the same block for phase 3 of the reconcile as the agent did. Without this, the core could have
-        selected no block, if the agent started phase 3 only because of an earlier deviation.
+        """Before phase 3 of the reconcile, select the block that the agent selected. After an earlier deviation, this
+        core may have selected a different block, or none.
         """
         if run.handler == "reconcile_phase_3":
             hashes = [block_hash for operation, block_hash in run.changes if operation == "chain+"]

@@ -28,8 +28,9 @@ ENOUGH = 8
 
 @dataclass
 class JudgedTimers:
-    """The numbers of timer expiries of all agents: those that were judged, and those among them for which the delay of
-    the machine was not measured.
+    """Two numbers for the expired timers of all agents: `expiries`, the number of examined expiries, and `unmeasured`,
+    the number of examined expiries for which the delay of the machine was not measured. Expiries in virtual time are
+    not counted.
     """
 
     expiries: int = 0

@@ -12,12 +12,12 @@ NameOf = Callable[[str], str]
 """A function that returns the name of the block with a given hash."""
 
 CHOOSES = 15
-"""The number of the Algorithm whose trace line contains the chosen block. All others record the counted votes or
-answers.
+"""The number of the Algorithm whose trace line contains the chosen block. The trace lines of other Algorithms contain
+the counted votes or answers.
 """
 SHOWN = 3
-"""Maximum number of changes or messages that the description of a step lists. The description counts all further
-ones.
+"""Maximum number of changes or messages that the description of a step lists. For further changes or messages, the
+description gives only their number.
 """
 
 

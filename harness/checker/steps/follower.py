@@ -40,8 +40,8 @@ PAUSES = "receive_response_block_for_hash"
 """Name of the handler that pauses and continues the phase 3 timer. No record shows this pause."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Message handlers that change a timer. The effects of all other message handlers can be undone with the recorded
-changes alone.
+"""Message handlers that change a timer. The comparison must save the timers before it runs one of these handlers. To
+undo any other message handler, it needs only the recorded changes.
 """
 
 Delayed = Callable[[float, float], bool]
@@ -134,7 +134,9 @@ class StepComparer:
         """The last pause of the phase 3 timer: the number of the trace line, and the time on the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """The last compared state of the agent, if the reference has not changed since. It saves a comparison."""
+        """The agent's state at the last comparison, if the reference has not changed since then. It makes another
+        comparison unnecessary.
+        """
 
     def follow(self, line: int, run: HandlerRun) -> None:
         """Compare this handler run with the reference. Also check that the agent omitted no earlier handler run."""
@@ -288,8 +290,9 @@ class StepComparer:
         return twin
 
     def foresee(self, line: int, run: HandlerRun) -> list[StepDeviation]:
-        """Return a deviation for each local event whose handler is missing before the given handler run, or that has an
-        additional handler run. This object does not change, and no handler runs.
+        """Check the local events before the given handler run. Return a deviation if a local event did not run its
+        handler, or if a handler ran without its local event. The check changes nothing in this object and runs no
+        handler.
         """
         foreseeing = self.copy()
         if foreseeing.lost is None:
@@ -308,8 +311,8 @@ class StepComparer:
     # Runs that should have come before
 
     def _triggered(self, line: int, run: HandlerRun, by: str | None) -> None:
-        """Report handlers that a local event should have triggered but that did not run, and handlers that ran without
-        their event.
+        """Report two kinds of errors: a local event did not run its handler, or a handler ran without its local
+        event.
         """
         self._state = None
         triggered = self._core.triggered
@@ -373,9 +376,8 @@ class StepComparer:
         ]
 
     def _callback_is_lost(self, line: int, run: HandlerRun, due: Iterable[Timer]) -> bool:
-        """Report timers that the agent stopped or restarted after their expiry without running their handlers.
-
-        Such a missing handler run causes the differences that follow. Return true if such a timer was found.
+        """Report each expired timer that the agent stopped or restarted without running the handler of the timer. The
+        missing handler run causes the differences that follow. Return true if such a timer was found.
         """
         is_lost = False
         for timer in due:

@@ -75,7 +75,7 @@ LINES_AFTER = 8
 JOINED = "a part of the file is missing, and the line is joined from two lines"
 """The phrase for the damage to a line that consists of the beginning of one line and the end of a later line."""
 MAX_FURTHER = 2
-"""Maximum number of lines that may be missing among these lines."""
+"""Maximum number of further lines that may be missing among the lines after the difference."""
 MAX_ANSWERS = 4
 """Maximum number of consecutive lost lines with answers to one question."""
 COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainContainResponse, NextInSequenceResponse))
@@ -204,11 +204,11 @@ def _differ_in_one_character(text: str, other: str) -> bool:
 
 
 def _has_impossible_top(before: StepComparer, deviation: StepDeviation, line: Line, following: Sequence[Line]) -> bool:
-    """Return true if the recorded state differs from the expected state only in the top chain hash, and the next lines
-    agree with the expected hash.
+    """Return true if the top chain hash on the line is damaged: the recorded state differs from the expected state only
+    in this hash, and the next lines agree with the expected hash.
 
-    Such a line may also be the last one before lost lines, because damage can join the beginning of a line with the end
-    of a later line.
+    Such a line may also come immediately before lost lines, because damage can join the beginning of a line with the
+    end of a later line.
     """
     number, run = line
     expected = deviation.expected
@@ -370,10 +370,11 @@ def _with_local_events_more(before: StepComparer, run: HandlerRun) -> Iterator[S
 
 
 def _with_an_expiry_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference after the expiry of a timer, and after the local events that this triggers.
+    """Yield copies of the reference after the expiry of a timer, and after the local events that the handler of the
+    timer triggers.
 
-    Algorithm 5, Vote Timer Expiration, does nothing during a reconcile. If its line is lost then, the loss shows only
-    after the reconcile. The function therefore also yields a copy in which the voting timer is stopped.
+    Algorithm 5, Vote Timer Expiration, does nothing during a reconcile. If its trace line is lost, the difference
+    appears only after the reconcile. The function therefore also yields a copy in which the voting timer is stopped.
     """
     voting = before.state.voting_timer
     due_s = None if voting.deadline is None else before.mission_s(voting.deadline)
