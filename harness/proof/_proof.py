@@ -296,10 +296,9 @@ def _prove_single_agents(
 
 
 def _with_instants(bounds: Bounds) -> Bounds:
-    """Return the same bounds with a network that loses and duplicates messages, in place of the network `any`, in which
-    messages may also be arbitrarily late.
-
-    With the new bounds, each path through the states is a possible run. With the network `any`, this is not certain.
+    """Return the same bounds, except that the network `any` becomes a network that loses and duplicates messages. In
+    the new network, messages are never arbitrarily late. Each path through the states is then a possible run. With the
+    network `any`, this is not certain.
     """
     return replace(bounds, network="lossy", faults=tuple(dict.fromkeys((*bounds.faults, "duplicate"))))
 
@@ -375,8 +374,9 @@ def _show(proof: Proof, graph: StateGraph, path: Path, name: str) -> None:
 
 
 def _known_cycles(graph: StateGraph) -> list[list[int]]:
-    """Return the cycles of an incomplete graph. If a state of the graph can represent several states, a cycle may be
-    impossible. Only cycles that are confirmed within `CYCLES_LOOKED_FOR_S` are then returned.
+    """Return the cycles that the search finds in an incomplete graph. If states of the graph represent several states,
+    each cycle must be confirmed with exact states. The search for confirmed cycles ends after `CYCLES_LOOKED_FOR_S`
+    seconds.
     """
     if graph.states.exact:
         return [*cycles(graph)]

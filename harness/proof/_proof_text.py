@@ -55,7 +55,9 @@ def in_words(proof: Proof) -> Iterator[str]:
 
 
 def _tighter(bounds: Bounds) -> list[str]:
-    """Return options of the command that would reduce the number of states, for a proof that reached a limit."""
+    """Return command options that reduce the number of states. They are suggested after a proof that reached a
+    limit.
+    """
     if bounds.network == "any" or bounds.timers_any:
         return []
     options = ["--losses 1"] if bounds.network == "lossy" and bounds.losses is None else []

@@ -33,8 +33,8 @@ class BoundsError(HarnessError):
 class Bounds:
     """The bounds of a proof: `agents` agents (1 to 9) complete `blocks` blocks in all (1 to 9).
 
-    - `network`: `lossless`; `lossy`, where any agent may lose any message; `any`, where messages may also be late,
-      repeated and out of order.
+    - `network`: one of three values. With `lossless`, no message is lost. With `lossy`, any agent may lose any message.
+      With `any`, messages may also be late, repeated and out of order.
     - `faults`: any of `reboot`, `death` and `duplicate`. A reboot and a death happen at most once in a run.
     - `timers_any`: timers may expire in any order, regardless of their durations.
     - `coincidences`: the maximum number of coincidences. In a coincidence, two independent events happen at the same
@@ -45,14 +45,15 @@ class Bounds:
     - `steps`: compare each step of the agents with the step of the reference implementation.
     - `stagger`: for each timer, the seconds by which it is longer than the same timer of the agent with the next lower
       ID.
-    - `captured`: the ID of an agent whose keys an attacker has. From an arbitrary moment on, the attacker sends in its
-      name.
-    - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Any of the agents can
-      receive each message.
+    - `captured`: the ID of an agent whose keys an attacker has. From an arbitrary moment on, the attacker sends in the
+      name of this agent.
+    - `lies`: the maximum number of messages that the attacker sends, unless the network is `any`. Each message can
+      reach any agents.
     - `clocks_any`: at each comparison of two blocks, either of them may be the older one.
-    - `losses`: the maximum number of lost messages that would have had an effect. None means any number.
-    - `zones_contained`: a state also represents each state in which all agents have the same local states, and whose
-      possible timer values are a subset.
+    - `losses`: the maximum number of lost messages, without messages that would have had no effect. None means any
+      number.
+    - `zones_contained`: a state also represents other states. These states have the same local states, but only some of
+      the possible timer values.
     - `crossing`: messages of several agents may cross. If false, all consequences of an action end before the next
       action.
 
@@ -158,8 +159,9 @@ class Bounds:
     @property
     def nameless(self) -> bool:
         """True if states are stored without the IDs of agents, so that agents with equal states are equal. Each agent
-        then counts itself as agent 1. False if an agent is captured or the network is `any`, because messages then
-        depend on the sender's ID.
+        then uses the ID 1 for itself.
+
+        False if an agent is captured or the network is `any`, because messages then depend on the sender's ID.
         """
         return self.reduced and self.captured is None and self.network != "any"
 

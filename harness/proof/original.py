@@ -98,8 +98,11 @@ class ProofComparison:
 def code_of(original: str) -> Iterator[Path]:
     """Yield a directory with the code of the agent core that `original` names.
 
-    `original` is "installed" (the core of this installation, for a proof with a variant), a directory that contains
-    `ucp/`, or a commit of this clone.
+    There are three possible values of `original`:
+
+    - "installed": the core of this installation. A proof with a variant uses this value.
+    - a directory that contains `ucp/`
+    - a commit of this clone
 
     Raises OriginalError, or RepositoryError for an unknown commit.
     """

@@ -37,8 +37,8 @@ class _KnowledgeFromAgent(NamedTuple):
 
 
 class ForgedTimestamps:
-    """Timestamps for forged blocks. They lie before, between and after the timestamps of `blocks` honest blocks, so
-    that up to `lies` forged blocks can have any age relative to honest blocks.
+    """Timestamps for forged blocks. They lie before, between and after the timestamps of `blocks` honest blocks. There
+    are enough timestamps to give each of up to `lies` forged blocks any age relative to the honest blocks.
     """
 
     def __init__(self, blocks: int, lies: int) -> None:
@@ -68,8 +68,8 @@ class Attacker:
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
     def forged_messages(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
-        """Yield the attacker's actions that have an effect. An action sends one message to one set of receivers, and
-        the message must affect each receiver.
+        """Yield each action of the attacker. In an action, the attacker sends one message to one set of agents. Actions
+        in which the message has no effect on one of these agents are omitted.
         """
         messages = dict.fromkeys(
             message for place, material in self.material(locals_) for message in self._to(locals_[place], material)
@@ -118,13 +118,14 @@ class Attacker:
 
 
 class AttackerKnowledge:
-    """The knowledge of the attacker in the network model `any`, where each agent is explored alone.
-
-    The attacker can send each message to each agent any number of times.
+    """The knowledge of the attacker in the network model `any`, where each agent is explored alone. The attacker can
+    send each message to each agent any number of times.
 
     Blocks are numbered in the order of their timestamps. The blocks with the numbers `ordinals` name the captured
-    vehicle as their author, and the attacker has them from the beginning. The attacker repeats the proposals of other
-    agents. The attacker need not repeat their queries, because each agent can receive the original queries.
+    vehicle as their author. The attacker knows these blocks from the beginning.
+
+    The attacker repeats the proposals of other agents. It does not repeat their queries, because each agent can receive
+    the original queries.
     """
 
     def __init__(self, bounds: Bounds, ordinals: Iterable[int]) -> None:

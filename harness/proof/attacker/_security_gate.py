@@ -56,9 +56,10 @@ class SecurityGate:
         """Return a new encrypted datagram with this message, in the name of the captured vehicle or of `sender`.
 
         If `genuine` is true, the block in the message has the signature of its author, which the attacker received
-        together with the block. Otherwise the attacker signs the block with the captured key. If the message is an
-        answer, the datagram says that it answers a new request of the captured vehicle, which no agent has received. No
-        agent can therefore know a newer request.
+        together with the block. Otherwise the attacker signs the block with the captured key.
+
+        An answer names the request that it answers. The datagram names a new request of the captured vehicle. No agent
+        has received this request, so no agent can know a newer one.
         """
         from ucp.secure.block_signature import sign_block
         from ucp.secure.sealed_datagrams import AnsweredRequest

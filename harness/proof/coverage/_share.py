@@ -27,8 +27,8 @@ class ExistingStates:
 
 
 def existing(bounds: Bounds, *, most_bytes: float = 4e9, most_s: float = float("inf")) -> ExistingStates:
-    """Return all agent states and (state, input) pairs within the bounds. If a limit of memory or time is reached,
-    return the states and pairs that were found before.
+    """Return all agent states and (state, input) pairs within the bounds. If the search reaches a limit of memory or
+    time, return the states and pairs that were found before the limit.
     """
     there = ExistingStates(bounds, set(), set())
     if bounds.network == "any":
@@ -64,8 +64,8 @@ SCHEMA = "ucp-coverage/1"
 
 @dataclass(frozen=True)
 class CoverageShare:
-    """How much of the existing states, inputs or branches runs have reached: the number within the bounds of a proof,
-    and the number outside of them.
+    """The coverage of states, inputs or branches: the number of reached ones within the bounds of a proof, the number
+    that exist within these bounds, and the number of reached ones beyond the bounds.
     """
 
     reached: int
@@ -101,8 +101,8 @@ def not_taken(reached: ReachedStates) -> list[Branch]:
 
 
 def to_json(reached: ReachedStates, there: ExistingStates | None) -> dict[str, object]:
-    """Return the coverage as a JSON document. `there` contains the existing states and pairs. If it is given, the
-    document also contains the share of them that the runs reached.
+    """Return the coverage as a JSON document. If the existing states and pairs are given (`there`), the document also
+    contains the share of existing states and pairs that the runs reached.
     """
     missing = not_taken(reached)
     document = {

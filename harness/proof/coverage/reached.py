@@ -135,7 +135,9 @@ def reached_in(evidence: Evidence) -> ReachedStates:
 
 
 def simulate_watched(scenario: Scenario, seed: int, watch: Watch, **options: Any) -> Simulated:
-    """Simulate a run with traces. Messages without effect are delivered too, so that traces contain their branches."""
+    """Simulate a run with traces. The simulation also delivers messages that have no effect. The traces then contain
+    the branches in which agents ignore messages.
+    """
     return simulate_in_memory(_WatchedRunRecorder(watch), scenario, seed, deliver_all=True, **options)
 
 

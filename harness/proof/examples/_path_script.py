@@ -30,8 +30,8 @@ ROGUE_LATENCY_S = LATENCY.mean_s
 MOMENT_S = 0.001
 """Seconds between two events that must happen in a certain order."""
 NEXT_INSTANT_SOON_S = 0.1
-"""Limit of the time until the next instant, in seconds. If the next instant is nearer, messages take only MOMENT_S, so
-that they arrive before it.
+"""If the next instant follows within this number of seconds, messages take only MOMENT_S, so that they arrive before
+the next instant.
 """
 SETTLES_S = 60
 NO_CLOCKS = "if ties of phase 2 go as no clocks make them go"
@@ -87,7 +87,7 @@ class PathScript:
             self._swarm.coincidences(graph.states[number], move.actions)
             for number, move in zip(path, self._moves, strict=False)
         )
-        """Number of pairs of instants on the path that are equal only by chance."""
+        """Number of coincidences on the path: pairs of independent instants that have the same time only by chance."""
         begin = graph.states[path[0]]
         self._agents = [_AgentOnPath(place + 1, local) for place, local in enumerate(begin[AGENTS:])]
         self._sent: Counter[tuple[int, str]] = Counter()

@@ -17,8 +17,8 @@ from harness.proof.model._block_renaming import Ordinals
 from ucp.clock import MICROSECONDS
 
 DISTANCES_S = (5.0, 2.0, 1.0, 0.5, 0.2, 0.0)
-"""Minimum distances of two steps in seconds, to try in this order. The first one with which all timer durations are
-possible is used.
+"""Minimum numbers of seconds between two steps of a path. They are tried in this order, until one permits all timer
+durations.
 """
 FIRST_INSTANT_S = 1.0
 

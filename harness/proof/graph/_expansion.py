@@ -20,10 +20,10 @@ _Following = dict[Actions, dict[int, None]]
 class StateExpansion(NamedTuple):
     """The successors of one state of the swarm. `transitions` is the number of transitions from this state.
 
-    The other fields contain only successors without a lost message and without a new block. For each timer that may
-    expire next, `by_timer` contains the possible successors. In a successor, the timer has expired alone, or after or
-    together with other timers that must expire at the same moment. `crossing` contains the successors in which several
-    timers expire at the same moment.
+    The other fields contain only successors without a lost message and without a new block. `by_timer` contains a group
+    of successors for each timer that may expire next. In the successors of a group, this timer has expired, and in some
+    of them also timers that must expire at the same moment. `crossing` contains the successors in which several timers
+    expire at the same moment.
     """
 
     transitions: int
@@ -32,9 +32,7 @@ class StateExpansion(NamedTuple):
 
 
 def expanded(swarm: ModelSwarm, state: State, number_of: NumberOf) -> StateExpansion:
-    """Return the successors of a state. The function calls `number_of` for each successor in order to get the number of
-    the successor.
-    """
+    """Return the successors of a state. `number_of` is a function that stores a successor and returns its number."""
     lossy = swarm.bounds.network == "lossy"
     transitions = 0
     losing_nothing: _Following = {}

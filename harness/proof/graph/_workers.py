@@ -1,9 +1,10 @@
 """Explore states in worker processes on all processor cores.
 
-The workers are forked processes. Each worker starts with the agents and steps that are known at the fork. From then on,
-it numbers new local states and zones itself, so the numbers of processes differ. If a process mentions a state to
-another process and knows the receiver's number of this state, it uses this number. Otherwise it uses its own number.
-The first time, it also sends the definition of the state.
+The workers are forked processes. Each worker starts with the agents and steps that are known at the fork. After the
+fork, each process numbers new local states and zones itself, so the same state has different numbers in different
+processes. A message between two processes identifies a state by the receiver's number if the sender knows this number.
+Otherwise the message contains the sender's number. When a process sends its own number of a state for the first time,
+it adds the definition of the state.
 
 The main process distributes the states in order, and adds their successors in the same order. The result is therefore
 the same as with one process.
@@ -33,7 +34,7 @@ WAIT_S = 0.5
 WORTH_WORKERS = 500
 """Minimum number of waiting states for which worker processes are used. For fewer states, they would save no time."""
 CHUNK = 100
-"""Maximum number of states in one task of a worker."""
+"""Maximum number of states that the main process puts into one task of a worker."""
 MAX_REPORTED = 500_000
 """Maximum number of states that a worker remembers having sent to the main process. Above this number, the worker
 forgets them and sends them again.
@@ -165,8 +166,8 @@ class _StateTranslator:
 
 
 class _WorkerFunction:
-    """The function that a worker process runs. It returns the successors of the states in a task, or the numbers of
-    votes that they need.
+    """The function that a worker process runs. For the states in a task, it computes the successors, or the number of
+    further votes until all chains are equal.
     """
 
     def __init__(self, swarm: ModelSwarm) -> None:

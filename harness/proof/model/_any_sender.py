@@ -1,14 +1,14 @@
 """Explore each agent alone, in a network that may lose, duplicate, delay and reorder messages without limit (network
 model `any`).
 
-In such a network, an agent can receive each message that any agent has sent at any moment, any number of times.
-Otherwise an agent does not depend on the other agents, with one exception: no agent can mention a block before the
-block is completed.
+In such a network, an agent can receive a message at any moment, and any number of times, as soon as any agent has sent
+the message. The agent depends on other agents in one further way: no agent can mention a block before the block is
+completed.
 
-The local states of each agent and the sent messages are collected together until no new ones appear. The result
-contains every local state and message of every possible run. It may contain more, because some of these messages may
-never occur in the same run. A property of all collected states therefore holds in every run. If one of the states
-violates a property, it is not certain that a run does.
+The exploration collects the local states of each agent and the sent messages until no new ones appear. The result
+contains every local state and message of every possible run. The result may contain more, because some of these
+messages may never occur in the same run. A property of all collected states therefore holds in every run. If a
+collected state violates a property, however, it is possible that no run does.
 """
 
 import time
@@ -139,8 +139,8 @@ class _BlockDistribution:
         the captured vehicle.
         """
         self._delivered_forgeries: dict[int, tuple[ForgeryMaterial, int]] = {}
-        """Agent -> the data from which the last forged messages to the agent were made, and a number. The forged
-        messages were delivered to this number of states of the agent.
+        """Agent -> the data from which the attacker last formed messages to the agent, and the number of the agent's
+        states in which these messages were delivered.
         """
         self._explored = 0
         """Number of states whose own actions were explored. An own action needs no received message."""
@@ -238,8 +238,8 @@ class _BlockDistribution:
             self._heard.hears(said[0], self.local.messages[said[1]])
 
     def _deliver_forgeries(self, agent_id: int, states: list[SingleAgentState]) -> bool:
-        """Let the attacker send each possible message to an agent in each of these states. Return true if any of these
-        messages is new.
+        """Let the attacker send each possible message to an agent in each of these states. Omit messages that were
+        already delivered in the same state. Return true if any message was delivered.
         """
         if self._heard is None:
             return False

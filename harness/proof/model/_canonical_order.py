@@ -42,7 +42,8 @@ several states.
 
 
 class CanonicalOrder:
-    """An object that puts the agents of a state into the order that represents all equivalent orders.
+    """The order of the agents that represents all equivalent orders. The method `of` puts the agents of a state into
+    this order.
 
     Agents use IDs for each other. `name_of` returns the ID that the agent at one position uses for the agent at another
     position.
@@ -105,8 +106,8 @@ class CanonicalOrder:
         return timers
 
     def _orders(self, locals_: tuple[int, ...], zone: int, timers: Sequence[range]) -> Iterator[Places]:
-        """Yield all orders of the agents in which the descriptions of the agents are sorted in ascending order. Agents
-        with equal descriptions are yielded in every order.
+        """Sort the agents by their descriptions, and yield each possible order. There are several orders if agents have
+        equal descriptions, because these agents can be in any order among themselves.
         """
         known, pattern = self._local.known, self._local.pattern
         bounds = self._zones.bounds(zone) if zone else [()]
@@ -192,7 +193,7 @@ class CanonicalOrder:
         return [{self._place_of(other, place) for other in snapshot[name]} for name in NAMES_OF_OTHERS]
 
     def _place_of(self, name: int, place: int) -> int:
-        """Return the position of the agent for which the agent at `place` uses this ID."""
+        """Return the position of the agent that has this ID for the agent at `place`."""
         return name - 2 if name - 2 < place else name - 1
 
     def _described_in_order(

@@ -31,7 +31,7 @@ from harness.proof.model._zones import NOTHING_RUNS, ZoneTable
 State = tuple[int, ...]
 """A global state: the number of completed blocks, the remaining faults, the zone, and the local states.
 
-The remaining faults are encoded in one number. It has a bit for each fault and for the capture. It also contains the
+One number encodes the remaining faults. This number has a bit for each fault and for the capture. It also contains the
 remaining numbers of forged messages, coincidences and losses.
 """
 MOST_KNOWN = 200_000
@@ -246,10 +246,11 @@ class ModelSwarm:
         return self.zones.coincidences(state[ZONE], ended) + len(actions) - len(ended)
 
     def _distinct(self, state: State, choices: Iterable[tuple[int, ...]]) -> Iterator[tuple[int, ...]]:
-        """Yield one of each group of equivalent choices. A choice is a tuple of positions of agents.
+        """Return the choices without equivalent ones: of each group of equivalent choices, yield only the first. A
+        choice is a tuple of positions of agents.
 
-        Agents without a running timer that are in the same local state are equivalent, unless an agent has counted the
-        votes of only some other agents.
+        Two agents are equivalent if they are in the same local state and have no running timer. If an agent has counted
+        the votes of only some other agents, no agents are equivalent.
         """
         known = self.local.known
         locals_ = state[AGENTS:]
@@ -355,8 +356,8 @@ class ModelSwarm:
         )
 
     def _running_after(self, at: dict[tuple[int, int], int], there: AgentStates) -> tuple[int, ...]:
-        """Return, for each timer that runs after a step, the number that it had before the step. For a timer that the
-        step started, the result is instead -1 minus its duration in microseconds.
+        """Return a number for each timer that runs after a step. For a timer that ran before the step, it is the
+        timer's previous number. For a timer that the step started, it is -1 minus the timer's duration in microseconds.
         """
         running = []
         for place, local in enumerate(there.locals):

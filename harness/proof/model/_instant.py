@@ -78,7 +78,7 @@ class MessageRound(NamedTuple):
 
 
 class FinalMessageRound(NamedTuple):
-    """The last round of messages in an instant. It refers to the round before it, and so on.
+    """The last round of messages in an instant. `last_round` contains this round and, linked to it, all earlier rounds.
 
     `lost` is the number of lost messages. A message counts once for each receiver that loses it. The number is 0 if
     losses are not counted.
@@ -274,11 +274,11 @@ class InstantOutcomes:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """Return the possible steps if the agent only counts these messages, so that their order has no effect. Return
-        None for all other messages.
+        """Return the possible steps of an agent that ignores or only counts each of these messages. The order of the
+        messages then has no effect. Return None if the agent does anything else with one of the messages.
 
-        Whether an answer counts depends only on the state without the vote counts, and on whether its sender is already
-        counted (docs/explanation/proof.md).
+        Whether the agent counts an answer depends on only two things: the state without the vote counts, and whether
+        the sender of the answer is already counted (docs/explanation/proof.md).
         """
         hear, only_counts, lets_be = self._local.hear, self._local.only_counts, self._local.lets_be
         matter, others = [], []
@@ -345,9 +345,8 @@ class InstantOutcomes:
 
     def _that_matter(self, local: int, heard: ReceivedMessages) -> list[int]:
         """Return the indices of the messages that may change the agent or cause an answer, directly or after other
-        messages of this round.
-
-        Return all indices for a faulty agent that reaches new states again and again by the same messages.
+        messages of this round. If the agent reaches more than `MOST_SEEN` states by these messages, it is faulty, and
+        the method returns all indices.
         """
         seen, waiting = {local}, [local]
         matter: set[int] = set()
@@ -366,14 +365,18 @@ class InstantOutcomes:
 
 
 def _keep(results: dict[AgentStates, FinalMessageRound], there: AgentStates, ending: FinalMessageRound) -> None:
-    """Store this way to reach a result, unless a stored way loses at most as many messages."""
+    """Store the messages that lead to a result, unless stored messages with the same result have at most as many
+    losses.
+    """
     known = results.get(there)
     if known is None or ending.lost < known.lost:
         results[there] = ending
 
 
 def _keep_fullest(orders: dict[_Key, tuple[int, ...]], there: _Key, order: tuple[int, ...]) -> None:
-    """Store this way to reach a result, unless a stored way contains at least as many different messages."""
+    """Store an order of messages that leads to a state, unless a stored order for this state contains at least as many
+    different messages.
+    """
     known = orders.get(there)
     if known is None or len(set(order)) > len(set(known)):
         orders[there] = order

@@ -42,8 +42,8 @@ class KnownLocalState:
     """The numbers of the blocks in the agent's chain."""
     flaw: PropertyViolation | None
     anonymous: int
-    """A number that is equal for states that differ only in which agents voted or answered. It is the same on all
-    machines.
+    """A number for the state that ignores which agents voted or answered. States that differ only in these agents have
+    the same number. It is equal on all machines.
     """
     names_others: bool
     deceived: bool
@@ -100,7 +100,9 @@ class KnownStates:
         return number
 
     def with_tallies(self, local: int, tallies: Snapshot) -> int:
-        """Return the number of the state that is equal to this one except for its vote counts, which are `tallies`."""
+        """Return the number of the state that results from this state with the vote counts `tallies`. All other parts
+        stay equal.
+        """
         known = self.known[local]
         snapshot = known.snapshot | {name: self._parts.part(name, value) for name, value in tallies.items()}
         key = self._parts.key(known.agent_id, known.flaw, snapshot)
@@ -114,7 +116,7 @@ class KnownStates:
     # Names of other agents
 
     def renamed(self, local: int, names: Names) -> int:
-        """Return the number of the state in which the other agents have new IDs."""
+        """Return the number of the state that results from this state with new IDs for the other agents."""
         if not self.known[local].names_others or self.known[local].flaw is not None:
             return local
         key = local, names
@@ -127,14 +129,12 @@ class KnownStates:
         return number
 
     def renamed_back(self, local: int, names: Names) -> int:
-        """Return the number of the state to which `renamed` with these IDs would give this state. It undoes the
-        renaming.
-        """
+        """Return the number of the state before the method `renamed` replaced its IDs by `names`."""
         return self.renamed(local, _inverse(names))
 
     def names_in_order(self, local: int, sender: int) -> Names | None:
-        """Return new IDs for the other agents, as an agent sees them: counted agents come first, and the sender
-        follows. Return None if the IDs are already in this order.
+        """Return new IDs for the other agents in a fixed order: the agents whose votes or answers are counted are
+        first, then the sender, then all others. Return None if the IDs are already in this order.
 
         If states are stored without agent IDs, an agent behaves in the same way with the new IDs
         (docs/explanation/proof.md).

@@ -41,8 +41,8 @@ Content = tuple[int, Snapshot, "PropertyViolation | None", Ordinals]
 
 
 OTHER_COUNTS = ((1, 0.0), (2, 60.0), (1000, 10_000.0))
-"""Values of the counters, and mission seconds, with which the prover repeats each step to show that they have no
-effect. Only in proofs without merged states.
+"""Pairs of a counter value and a mission second. The prover repeats each step with each pair, to show that counters and
+time have no effect. It does so only in proofs without merged states.
 """
 COUNTED = ("reconciles", "sent", "chain_changed_at")
 """Attributes of the state that only count events, each with its name in error messages."""
@@ -155,10 +155,9 @@ class LocalStates(KnownStates):
         return ends
 
     def older(self, local: int, timer: int, result: int) -> tuple[int, frozenset[int]]:
-        """A timer expiry has this result only if one candidate block is older than others. Return the candidate that
-        must be the oldest, and the candidates that must be newer.
-
-        Block 0 is the inception block. The set of candidates is empty if the agent does not compare ages.
+        """Return the block ages that this result of a timer expiry requires: the candidate block that must be the
+        oldest, and the candidates that must be newer. Block 0 is the inception block. The set of newer candidates is
+        empty if the agent does not compare ages.
         """
         ends = self.ends(local, timer)
         oldest = ends[result].oldest

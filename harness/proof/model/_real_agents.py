@@ -120,8 +120,8 @@ def end_timer(timer: int, oldest: bytes | None, agent: Agent) -> None:
 
 
 def end_at_once(agent: Agent) -> str | None:
-    """Let the timers expire that expire before any message can arrive. If a handler raises an exception, return its
-    text. Otherwise return None.
+    """Run the handlers of very short timers, which expire before any message can arrive. If a handler raises an
+    exception, return its text. Otherwise return None.
     """
     now_s = agent.state.now
     try:

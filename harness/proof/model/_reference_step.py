@@ -23,8 +23,8 @@ from ucp.trace import HandlerRun
 Give = Callable[[Any], None]
 """The type of a function that gives an input to an agent, which is a `ucp.agent.Agent` or a `ReferenceAgent`."""
 Make = Callable[[int, Callable[[], None]], Agent]
-"""The type of a function that creates an agent. The function gets the ID of the agent, and a second function that the
-agent calls after each handler run. The agent traces its handler runs.
+"""The type of a function that creates an agent with traces. Its arguments are the ID of the agent, and a function that
+the agent calls after each handler run.
 """
 
 

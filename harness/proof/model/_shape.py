@@ -3,9 +3,11 @@ shape.
 
 A shape identifies a block by its position among the blocks that the agent holds, sorted by timestamp and then by hash.
 Blocks that the agent does not hold are only counted. Like the reductions of `_local_steps.py`, a shape omits parts that
-are written before they are read. Of a vote, a shape only contains whether more agents approve than disapprove. The
-block under construction is omitted, because within the bounds of a proof each event fills a block. Shapes can therefore
-compare the states of any run of any mission with the states that exist within bounds.
+are written before they are read. For a vote, a shape contains only whether more agents approve than disapprove. The
+block under construction is omitted, because within the bounds of a proof each event fills a block.
+
+Because of these omissions, a state of any run of any mission can have the same shape as a state within the bounds of a
+proof.
 """
 
 from bisect import bisect_left
@@ -21,8 +23,8 @@ from ucp.state import AgentState
 Shape = tuple[Any, ...]
 
 LEFT_OUT = frozenset(("current_block", "completed", "newest_block_timestamp_us", "voters", "reconcile_responders"))
-"""Parts of an agent's state that a shape omits, although a snapshot contains them: the parts that are used to make
-blocks, and the members of vote counts.
+"""Parts of an agent's state that are in a snapshot, but not in a shape: the parts about completing blocks, and the sets
+of agents whose votes or answers are counted.
 """
 
 ELSEWHERE = -1
@@ -58,9 +60,8 @@ class HeldBlockOrder:
         )
 
     def number(self, shape: Shape) -> int:
-        """Return 64 bits of the hash of a shape, as a number. The number is equal on all machines.
-
-        `shape` describes the rest of a state with these blocks, or such a state together with an input.
+        """Return 64 bits of the hash of a shape, as a number. The number is equal on all machines. The hash covers
+        these held blocks and `shape`, which describes all other parts of a state, or of a state with an input.
         """
         number = self._numbers.get(shape)
         if number is None:

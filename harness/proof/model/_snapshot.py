@@ -28,14 +28,16 @@ an agent whose step depends on them.
 COUNTS = ("reconciles", "_sequence", "chain_changed_at")
 """The attributes in `REPORTED` that are counters and that no input sets."""
 FIXED = frozenset(("agent_id", "settings", "timers", "reconcile_timers", "running", "_tracing", "_seal", "sealed"))
-"""Attributes that need not be in a snapshot. They never change, or refer to the same objects as other attributes in it.
-Explored agents do not encrypt events.
+"""Attributes that need not be in a snapshot. Some never change. Some refer to the same objects as other attributes of
+the snapshot. `_seal` and `sealed` are unused, because explored agents do not encrypt events.
 """
 HANDED_OVER = frozenset(("outbox", "changes", "announced", "started"))
 LEFT_OUT = REPORTED | FIXED | HANDED_OVER
 
 NOW_S = 1000.0
-"""The mission second at which each step is computed. The zones contain the relevant times."""
+"""The mission second at which each step is computed. It is the same for all steps, because zones store the remaining
+times of timers.
+"""
 RUNNING_S = 1e15
 """The deadline that a timer gets in a computed step if it was running before the input."""
 
@@ -306,8 +308,8 @@ class SnapshotParts:
         return part
 
     def of(self, snapshot: Snapshot, like: Snapshot) -> Snapshot:
-        """Return the state `snapshot` with stored parts in place of equal parts. All parts of `like` must already be
-        stored.
+        """Return the state `snapshot`, in which each part is replaced by the equal stored part. Parts that are the same
+        objects in `like` are already stored.
         """
         return {
             name: value if like.get(name, self) is value else self.part(name, value) for name, value in snapshot.items()
@@ -345,7 +347,7 @@ class ReductionError(Exception):
 def check_that_nothing_is_lost(before: Snapshot, state: AgentState) -> None:
     """Raise ReductionError if the agent has lost a block.
 
-    If agents never lose a block, a state need not contain the list of completed blocks (characteristic 2).
+    States omit the list of completed blocks. This is correct only if agents never lose a block (characteristic 2).
     """
     held = {block.block_hash for name in ("blocks_to_be_committed", "reconcile_stack") for block in before[name]}
     held.update(before["chain"].parts["_block_of_hash"])

@@ -110,9 +110,8 @@ class ZoneTable:
 
     def adrift(self, zone: int) -> int:
         """Return the zone with the same differences between the timers, and with any remaining time until the first
-        expiry.
-
-        If no other event can happen before the first expiry, the time until then makes no difference.
+        expiry. The result represents many zones if no other event can happen before the first expiry, because the time
+        until then has no effect.
         """
         if zone not in self._adrift:
             matrix = [list(row) for row in self._matrices[zone]]
@@ -166,7 +165,9 @@ class ZoneTable:
         places = [0, *running]
 
         def bound(left: int, right: int) -> int:
-            """Return the upper bound of x_left - x_right. A newly started timer has its complete duration left."""
+            """Return the upper bound of x_left - x_right. The remaining time of a newly started timer is its complete
+            duration.
+            """
             left_s, left_place = (0, left) if left >= 0 else (-left - 1, 0)
             right_s, right_place = (0, right) if right >= 0 else (-right - 1, 0)
             return left_s - right_s + matrix[left_place][right_place]

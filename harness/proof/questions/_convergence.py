@@ -27,10 +27,10 @@ class ConvergenceResult:
 
     - `forks`: number of idle states with several different chains. `fork` is the one of these states that is nearest to
       the initial state.
-    - `cycles`: cycles as lists of their states, the nearest first.
+    - `cycles`: cycles as lists of their states. The cycle nearest to the initial state is first.
     - `astray`: numbers of states. Element n is the number of states from which the swarm cannot become idle with one
-      chain even after n further votes. The list ends with 0, or at one vote for each agent.
-    - `lost`: the nearest state from which one vote for each agent is not enough.
+      chain even after n further votes. The last element is 0, or belongs to as many votes as agents exist.
+    - `lost`: the nearest state for which one vote of each agent is not enough.
     - `reluctant`: the nearest state for which one vote is not enough.
     - `flaw`: a violation after further votes. It ended a path that might have led to one chain.
     """
@@ -88,8 +88,8 @@ def _idle_states(graph: StateGraph, check: Check) -> Iterator[tuple[int, int]]:
 def _needed(
     graph: StateGraph, forks: Sequence[int], watch: Watch, workers: Workers | None
 ) -> dict[int, int | PropertyViolation | None]:
-    """Return the number of further votes that each of these states needs. The number is None if one vote for each agent
-    is not enough.
+    """Return the number of further votes that each of these states needs. If one vote for each agent is not enough, the
+    dictionary contains instead the violation that ended a path, or None.
     """
     needed: dict[int, int | PropertyViolation | None] = {}
 

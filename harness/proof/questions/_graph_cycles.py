@@ -69,9 +69,8 @@ def _inside(after: Sequence[int]) -> tuple[int, ...]:
 
 
 def _number_in(graph: StateGraph, exact: StateGraph, state: int, numbers: dict[int, int]) -> int:
-    """Return the number in `graph` of a state of `exact`. Add the state and its path to `graph` if necessary.
-
-    `numbers` contains the states of `exact` that `graph` already has.
+    """Return the number that a state of the graph `exact` has in `graph`. If `graph` does not contain the state yet,
+    add the state and the path to it. `numbers` contains the states of `exact` that are already in `graph`.
     """
     path = [state]
     while path[-1] not in numbers:

@@ -34,12 +34,14 @@ class Livelock:
     """All endless cycles of one form, with an example.
 
     - `ways`: number of components of the graph with a cycle of this form.
-    - `coincidences`: number of pairs of instants on the example's path that must be equal by chance, up to the transit
-      time of a message. Another path may need fewer. None if timers expire in any order.
-    - `completions`: the possible times of the blocks on the path.
-    - `losses`: number of messages that receivers lose on the path.
+    - `coincidences`: number of coincidences on the path of the example. In a coincidence, two instants have the same
+      time by chance, up to the transit time of a message. Another path may need fewer. None if timers expire in any
+      order.
+    - `completions`: for each block on the path, the interval in which the block can be completed.
+    - `losses`: number of lost messages on the path. A message counts once for each receiver that loses it.
     - `cycle`: the cycle that the simulation of the example showed. None if the simulation took a different path.
-    - `contradictory`: true if no clocks can give all ties the results that the path requires.
+    - `contradictory`: true if the path is impossible with real clocks, because its ties require contradictory ages of
+      blocks.
     """
 
     ways: int

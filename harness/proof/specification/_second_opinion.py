@@ -58,7 +58,7 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """True if both explorations are complete or found a violation, and agree on the violation, the states, and
+        """True if no limit ended an exploration early, and both explorations agree on the violation, the states, and
         endless cycles.
         """
         same = not self.only_real and not self.only_specified and self.livelock == self.specified_livelock

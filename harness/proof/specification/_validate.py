@@ -22,8 +22,8 @@ from harness.scenario import Scenario
 from ucp.agent import HANDLERS
 
 STEPS_AT_ONCE = 20_000
-"""Minimum number of handler runs in a batch for one TLC process. A trace is never divided, so a batch may contain
-more.
+"""Minimum number of handler runs in a batch for one TLC process. A batch may contain more handler runs, because a trace
+is never divided.
 """
 MEMORY_MB = 2048
 
@@ -212,8 +212,8 @@ def _constants(trace: Trace) -> tuple[CheckedHeader, Constants]:
 
 
 def _look(constants: Constants, batch: _EncodedStepBatch, validation: TraceValidation) -> None:
-    """Check a batch with TLC. If TLC fails, divide the batch and check its parts, until only the agents that TLC cannot
-    check are omitted.
+    """Check a batch with TLC. If TLC fails, divide the batch into halves and check each half in the same way. In the
+    end, only agents with which TLC fails remain unchecked.
     """
     try:
         rejected = _rejected(constants, batch)
