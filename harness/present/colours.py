@@ -1,8 +1,8 @@
 """Choose a colour for each agent. The colours differ for any colour vision, in light and in dark mode.
 
 The first eight colours are those of Okabe and Ito (https://jfly.uni-koeln.de/color/), with grey in place of black.
-Further agents get the same hues lighter, darker, and with a dashed outline. After 32 agents the colours repeat. No
-picture relies on colour alone: every box also names its agent.
+Agents 9 to 16 have lighter colours of the same hues, agents 17 to 24 darker ones, and agents 25 to 32 lighter ones with
+a dashed outline. After 32 agents the colours repeat. No picture relies on colour alone: every box also names its agent.
 """
 
 from collections.abc import Iterable

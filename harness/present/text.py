@@ -85,8 +85,8 @@ def shown(words: str, style: str = "") -> Text:
 
 
 def did_you_mean(word: object, allowed: Iterable[object]) -> str:
-    """Return a hint with the most similar allowed word, such as "; did you mean `loss_15`?". Return an empty text if
-    all allowed words are different.
+    """Return a hint with the most similar allowed word, such as "; did you mean `loss_15`?". Return an empty text if no
+    allowed word is similar.
     """
     from difflib import get_close_matches  # imported late, because only errors need it
 

@@ -76,7 +76,7 @@ MAX_ROGUE_ROWS = 500
 @dataclass(frozen=True, slots=True)
 class InjectionRow:
     """A table row about one result of an injection. `message` is the type of the injected message. If the agents
-    refused the datagrams, `message` contains their reason instead.
+    refused the datagrams, `message` is instead the reason for the refusal.
     """
 
     at: str

@@ -29,7 +29,7 @@ class ConditionSpan:
     to_s: float
     text: str
     level: float = 1.0
-    """Share of the row's height (0 to 1) that the picture fills. It represents the value of the condition."""
+    """The value of the condition as a number from 0 to 1. The picture fills this share of the row's height."""
 
 
 def steps(changes: Sequence[tuple[float, str, float]], end_s: float) -> list[ConditionSpan]:

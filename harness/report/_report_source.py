@@ -35,7 +35,9 @@ class ReportSource:
 
     @cached_property
     def traces(self) -> dict[int, Trace]:
-        """The trace of each agent, by agent ID. Large traces lack the handler runs that only received a message."""
+        """The trace of each agent, by agent ID. From large traces, the reader omits handler runs that only received a
+        message.
+        """
         traces = self.archive.traces
         return {agent: trace.skimmed() for agent, trace in traces.items()} if self.archive.large else traces
 

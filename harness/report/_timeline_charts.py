@@ -143,10 +143,9 @@ def draw(
 
 
 def thin_states(spreads: Sequence[ReplicationFigures], end_s: float) -> Sequence[ReplicationFigures]:
-    """Return the part of a long list of states that is visible when the picture shows the whole run.
-
-    For each column of the picture, the result contains the last state and the state with the shortest mutual chain,
-    which is the common beginning of all chains.
+    """Remove states from a long list, without a visible change of the picture that shows the whole run. For each column
+    of the picture, the result contains two states: the last one, and the one with the shortest mutual chain, which is
+    the common beginning of all chains.
     """
     if len(spreads) <= MAX_MOMENTS:
         return spreads

@@ -174,8 +174,8 @@ def phases_in_words(reconcile: AgentReconcile) -> str:
 
 
 def group_commits(commits: Sequence[BlockCommit], end_s: float) -> list[list[BlockCommit]]:
-    """Combine commits of the same agent that are close in time, until at most `MAX_COMMITS` marks remain. If there are
-    more agents than that, combine all consecutive commits of an agent.
+    """Combine commits of the same agent that are close in time, until at most `MAX_COMMITS` marks remain. If the number
+    of agents is above `MAX_COMMITS`, combine all consecutive commits of an agent.
     """
     groups = [[commit] for commit in commits]
     for within_s in (end_s / parts for parts in (4096, 2048, 1024, 512, 256, 128, 64, 32, 16, 8, 4, 2, 1)):

@@ -32,15 +32,15 @@ class AgentProgram:
 
 
 def programs(record: RunRecord) -> list[AgentProgram]:
-    """Return the programs in the order of the lowest agent ID that ran each program. The list is empty if all agents
+    """Return the programs, sorted by the lowest ID of the agents that ran the program. The list is empty if all agents
     ran the harness's own program.
     """
     return [] if record.scenario is None else asked_for(record.scenario, record.agents)
 
 
 def asked_for(scenario: Scenario, agents: Mapping[str, AgentRecord] = MappingProxyType({})) -> list[AgentProgram]:
-    """Return the programs that the agents of a scenario use. If `agents` is given, the result also has the versions
-    that these agents reported in a run.
+    """Return the programs that the agents of a scenario use. If `agents` is given, the result also contains the program
+    versions that these agents reported in a run.
     """
     if not scenario.foreign:
         return []

@@ -4,14 +4,14 @@ A block appears once for each sequence of blocks below it. If agents with diverg
 is therefore on two branches (Figure 4.4). `marks` converts the tree to the marks of a picture: a box for each block,
 and an oval where chains end. On request, an ellipsis replaces the middle of a long sequence without branches.
 
-A chain can be longer than Python's recursion limit. All functions here use loops instead of recursion.
+A chain can be longer than Python's recursion limit. All functions here therefore use loops instead of recursion.
 
-`ChainTreeLayout` has the positions of all marks in a picture of the chain tree. Time grows upwards, and columns do not
-overlap. Each subtree is placed as close as possible to the subtrees on its left. Their outlines are compared row by row
-(after Reingold and Tilford, "Tidier Drawings of Trees", 1981). A block is below the middle of its successors. If more
-than half of the agents have the same successor, this successor is exactly above the block, and the others are at its
-sides. An oval marks the end of chains. It is above the last block of these chains, or on its right if other chains
-continue above it.
+`ChainTreeLayout` contains the positions of all marks in a picture of the chain tree. Time grows upwards, and columns do
+not overlap. Each subtree is placed as close as possible to the subtrees on its left. To find this place, the layout
+compares the outlines of the subtrees row by row (after Reingold and Tilford, "Tidier Drawings of Trees", 1981). A block
+is below the middle of its successors. If more than half of the agents have the same successor, this successor is
+exactly above the block, and the other successors are at the sides. An oval marks the end of chains. If other chains
+continue above the last block, the oval is to the right of this block, otherwise above it.
 """
 
 import math
@@ -35,7 +35,7 @@ class ChainTreeNode:
 
     block: ExportedBlock | None
     holders: list[int] = field(default_factory=list)
-    """The IDs of the agents whose chains contain this block after the same earlier blocks."""
+    """The IDs of the agents whose chains contain this block on top of the same earlier blocks."""
     ends: list[int] = field(default_factory=list)
     """Agents whose chains end at this block."""
     children: dict[str, "ChainTreeNode"] = field(default_factory=dict)
@@ -86,7 +86,8 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
     """Return the mark of the inception block. All other marks can be reached from this mark. `names` maps the hashes of
-    blocks to their names. The marks above a block are ordered by the lowest ID of the agents whose chains they show.
+    blocks to their names. Each mark above a block shows the chains of some agents. The marks are sorted by the lowest
+    ID of these agents.
     """
     root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]

@@ -1,16 +1,15 @@
-"""Compare two runs. Find the first handler run of an agent that occurs in only one of them.
+"""Compare two run directories: the keys of their scenarios, their traces, and their exported chains. Find the first
+handler run of an agent that occurs in only one of the runs.
 
 Runs are compared agent by agent and handler run by handler run. The comparison covers incarnation, handler, branch,
 trigger with the message number, sent messages, and changes of chain, deque and stack. Blocks are compared by name, such
 as 4.11, because hashes depend on timestamps. Times are not compared, because they differ between any two runs of
-processes. The state after a handler run follows from its changes, so it is not compared either. The exported chains are
+processes. The state after a handler run is not compared, because it follows from the changes. The exported chains are
 compared block by block.
 
 In virtual time, the same seed and scenario give identical traces. Runs of processes soon differ even without an error,
 because the kernel decides which of two messages arrives first. The first difference is still a good place to start an
 analysis.
-
-Compare two run directories: the keys of their scenarios, their traces, and their exported chains.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,8 +32,8 @@ class ComparedStep:
     """A handler run in the form in which two runs are compared. The comparison ignores the mission second `t` and the
     line number `line`.
 
-    `changes` contains pairs (operation, block), and `sent` contains pairs (message, block). The name of the block
-    represents it. None means that there is no block.
+    `changes` contains pairs (operation, block), and `sent` contains pairs (message, block). In these pairs, a block is
+    represented by its name, such as 4.11. The block is None for messages that concern no block.
     """
 
     life: int
@@ -108,8 +107,8 @@ def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
 
 @dataclass(frozen=True)
 class FirstDifference:
-    """The first position at which the two traces of an agent differ, with the handler run that each trace has there.
-    For a trace that has already ended, the handler run is None.
+    """The first position at which the two traces of an agent differ, and the two different handler runs at this
+    position. If one trace has already ended, its handler run is None.
     """
 
     number: int
@@ -124,10 +123,9 @@ class FirstDifference:
 
 @dataclass(frozen=True)
 class ChainDifference:
-    """The first position (from 1) at which the exported chains of an agent differ, with the name of the block that each
-    chain has there.
-
-    For a chain that has already ended, the name is None. If an agent has no export, its chain counts as empty.
+    """The first position (from 1) at which the two exported chains of an agent differ, and the names of the two
+    different blocks at this position. If one chain has already ended, its block name is None. If an agent has no
+    export, its chain counts as empty.
     """
 
     place: int
@@ -153,8 +151,8 @@ class RunDifference:
     agents: dict[int, AgentDifference]
     """An entry for every agent of the mission. In the entry of an agent without a difference, both fields are None."""
     handler_runs: int
-    """The number of equal handler runs of all agents. For each agent, only handler runs before its first difference
-    count.
+    """The number of equal handler runs, added over all agents. For each agent, only handler runs before its first
+    difference count.
     """
     exact: bool
     """True if the traces are equal to the last byte."""

@@ -87,8 +87,8 @@ class NetworkDivision:
 
 @dataclass(frozen=True, slots=True)
 class TrackSegment:
-    """A section of a flight path on which the vehicle belongs to the same part of the swarm all the time. `division` is
-    the division of the swarm at the start of the section.
+    """A section of a flight path on which the vehicle always belongs to the same part of the swarm. `division` is the
+    division of the swarm at the start of the section.
     """
 
     vehicle: int
@@ -168,7 +168,9 @@ def longest_divisions(all_divisions: Sequence[NetworkDivision], end_s: float, mo
 def flights(
     vehicle: int, tracks: VehicleTracks, network: Connectivity, all_divisions: Sequence[NetworkDivision], end_s: float
 ) -> Iterator[FlightPath]:
-    """Yield the flight path of a vehicle. If other vehicles replaced it after a loss, also yield their flight paths."""
+    """Yield the flight path of a vehicle. If the vehicle was lost and replaced, also yield the flight path of each
+    replacement.
+    """
     wreck: PositionFix | None = None
     for begin_s, until_s, lost in network.airborne_intervals(vehicle, end_s):
         flown = [fix for fix in tracks.by_vehicle[vehicle] if begin_s <= fix.at_s <= until_s]
@@ -228,7 +230,9 @@ class GroundRectangle:
 
 
 def extent(fixes: Sequence[PositionFix]) -> GroundRectangle:
-    """Return a rectangle on the ground around at least one position."""
+    """Return the rectangle on the ground that the map shows. The rectangle contains all given positions and a margin.
+    There must be at least one position.
+    """
     north, east = [fix.north_m for fix in fixes], [fix.east_m for fix in fixes]
     shortest = max(MIN_SPAN_M, MIN_ASPECT * max(max(north) - min(north), max(east) - min(east)))
     return GroundRectangle(*_widen(min(north), max(north), shortest), *_widen(min(east), max(east), shortest))

@@ -1,11 +1,12 @@
 """Read all data of a run that can be exported: its files, its clock, and all recorded values.
 
 The run may have been interrupted, some of its files may be damaged, or the command `import` may have created it from
-field logs. The export contains everything that is readable. `problems` contains a sentence for each file that is not.
+field logs. The export contains everything that is readable. `problems` contains a sentence for each unreadable file.
 
-Each line in the log file of a program begins with its time. Agents may use any log format. A line without a time gets
-the time of the previous line. If the first line has no time, it gets the start of the mission. Log files do not name
-their time zone. The reader assumes the zone in which the first line is nearest to the start of the mission.
+Each line in the log file of a program begins with its time. Agents may use any log format. A line without a time
+receives the time of the previous line. If the first line of a file has no time, it receives the time of the start of
+the mission. Log files do not name their time zone. The reader assumes the zone in which the first line is nearest to
+the start of the mission.
 """
 
 import math

@@ -204,10 +204,9 @@ class MissionTime:
 
 
 def mission_time(headers: Mapping[int, TraceHeader], record: RunRecord, problems: list[str]) -> MissionTime:
-    """Return the clock of the mission. The headers of the traces contain the start of this clock. If no trace has a
-    header, run.json contains it.
-
-    Add a sentence to `problems` for each invalid clock.
+    """Return the clock of the mission. The clock starts at the time that most headers of traces contain. If no header
+    contains a valid time, the clock starts at the time in run.json. Add a sentence to `problems` for each invalid
+    header.
     """
     epochs = {}
     for agent, header in headers.items():
@@ -234,8 +233,8 @@ def _speedup(headers: Mapping[int, TraceHeader], record: RunRecord) -> float:
 
 
 def _start_ns(record: RunRecord) -> int:
-    """Return the time at which the run started, in nanoseconds since the Unix epoch. It stands in for an unknown start
-    of the mission. Return 0 in virtual time.
+    """Return the time at which the run started, in nanoseconds since the Unix epoch. The caller uses it if the start of
+    the mission is unknown. Return 0 in virtual time.
     """
     try:
         start = datetime.fromisoformat(record.started_at or "")

@@ -1,11 +1,11 @@
 """Write a run as an MCAP file, which Foxglove, Lichtblick and PlotJuggler open without a plug-in.
 
-The file uses the protobuf schemas of Foxglove if one exists: LocationFix (for maps) and FrameTransform (for the 3D
-view) for positions, SceneUpdate for links and vehicles, and Log for lines of logs. All other values become the JSON
-topics of `_topics`. run.json and the chain exports are attached unchanged.
+The file uses the protobuf schemas of Foxglove for values that these schemas cover. LocationFix (for maps) and
+FrameTransform (for the 3D view) contain positions, SceneUpdate contains links and vehicles, and Log contains lines of
+logs. All other values become the JSON topics of `_topics`. run.json and the chain exports are attached unchanged.
 
-The 3D view shows a shape for each vehicle, and a line for each link coloured by its loss rate. Each vehicle is drawn
-once, in a coordinate frame that moves with it. Links are drawn again after movements.
+The 3D view shows a shape for each vehicle, and a line for each link. The colour of a line shows the loss rate of the
+link. Each vehicle is drawn once, in a coordinate frame that moves with it. Links are drawn again after movements.
 """
 
 import contextlib

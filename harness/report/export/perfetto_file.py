@@ -46,8 +46,9 @@ _LARGEST = 2**63 - 1
 _SEQUENCE = 1
 
 Event = tuple[int, int, Any]
-"""A packet of the trace with its sort key: time, rank, packet. Of packets with the same time, those about effects of a
-message have the higher rank 1, so that a message is sent before it is received.
+"""A packet of the trace with its sort key: time, rank, packet. Packets with the same time are sorted by rank, so that a
+message is sent before it is received. Handler runs that a message triggered and values of counters have rank 1. All
+other packets have rank 0.
 """
 
 

@@ -276,7 +276,7 @@ class AgentActions:
         return bool(self._held.not_in_chain) and b'"idle":true' in line
 
     def _begin(self) -> None:
-        """Forget the state of the agent, because it restarted without its disk."""
+        """Begin an incarnation of the agent that holds no blocks, and forget the state of the previous incarnation."""
         if self._has_started:
             self.changes.append(["z", self.at_s, self.agent_id])
         self._has_started, self._held, self._idle_too_early = True, HeldBlocks(), False

@@ -1,11 +1,16 @@
-"""The web server of the live page, and the functions that write the changes of a run to the log that it serves.
+"""The web server of the live page. The server reads the changes of a run from a log. This module also contains the
+functions that write the changes to the log.
 
 The server listens on 127.0.0.1 only, and requires the secret token in the page's address.
 
 At its start, the server makes a list of the files that it serves, so no address can reach another file. The
 Content-Security-Policy lets browsers load from this server only. Three checks reject requests from other pages in the
-same browser. Other pages do not know the token. Their requests have a foreign origin in the header Origin. If a foreign
-host name resolves to 127.0.0.1, the header Host shows that name.
+same browser:
+
+- A request without the secret token is rejected. Other pages do not know the token.
+- A request with a foreign origin in the header Origin is rejected.
+- A request with a foreign host name in the header Host is rejected. Such a request occurs if the foreign host name
+  resolves to 127.0.0.1.
 
 The log stores all changes for the live page. The changes of an active run are written as they occur, and the changes of
 a finished run all at once. Any number of browsers can read the log, each at its own speed. The log is an unnamed
@@ -101,8 +106,8 @@ GONE_S = 20.0
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 RequestHandler = Callable[[int, Any], None]
-"""A function that gets the number of a page and a request from this page. `LivePageServer.answer` sends the answer to
-the page.
+"""A function that receives the number of a page and a request from this page. `LivePageServer.answer` sends the answer
+to the page.
 """
 MOST_ANSWERS = 32
 """Maximum number of answers that wait for one page. A further answer replaces the oldest one."""

@@ -105,7 +105,7 @@ class Logbook:
     names: dict[str, str]
     """The name of each block, by block hash."""
     telemetry: bool = True
-    """True if the events come from the source `mavlink`. If the exports do not belong to a run, this is assumed."""
+    """True if the events come from the source `mavlink`, or if the exports do not belong to a run."""
     absent: dict[int, str] = field(default_factory=dict)
     """A sentence about each agent of the mission that has no export, by agent ID."""
     errors: list[str] = field(default_factory=list)

@@ -23,7 +23,8 @@ from ucp.trigger import LocalTrigger, MessageTrigger, TimerTrigger
 
 INSTANT_S = 1.5
 """Maximum number of mission seconds between a cause and its effect in the same instant. A timer that is late by at most
-this time counts as punctual. On a slow machine, the lateness of timers in mission seconds grows with the speedup.
+this time counts as punctual. The limit leaves room for slow machines, because the lateness of timers in mission seconds
+grows with the speedup.
 """
 
 
@@ -121,10 +122,10 @@ class StoryWriter:
             yield from (f"  {_listed(agents):<10}{line}" for line in lines)
 
     def _kind(self, action: AgentReaction) -> object:
-        """Return a key for an action. The story describes the actions of one agent with equal keys together.
+        """Return a key for an action. The story describes actions of one agent with the same key together.
 
-        Such actions handle equal answers. Equal answers arrive in random order, and only the first one has an effect.
-        The text must not depend on this order.
+        Actions that handle equal answers have the same key. Equal answers arrive in random order, and only the first
+        one has an effect. The text must not depend on this order.
         """
         run = action.runs[0]
         if action.cause is None or action.answer is None:
@@ -215,7 +216,7 @@ def _actions_with_causes(traces: Mapping[int, Trace]) -> list[AgentReaction]:
 
 
 def _set_cause(action: AgentReaction, sent: Mapping[tuple[int, int], Sequence[AgentReaction]]) -> None:
-    """Find the action that sent the message that triggered this action, and record it as the cause."""
+    """Record the cause of this action: the action that sent the triggering message."""
     run = action.runs[0]
     if not isinstance(run.trigger, MessageTrigger):
         return

@@ -249,8 +249,8 @@ def _parsed(path: Path, text: str) -> Story:
 
 
 def _in_its_line(problem: str, entry_lines: Mapping[str, Sequence[int]]) -> str:
-    """Return the error message with the line of the story's sentence, in place of the scenario key that the sentence
-    created.
+    """Return the error message in a form that names the line of the sentence in the story. The original message names
+    the scenario key that the sentence created.
     """
     entry = _ENTRY.match(problem)
     return f"line {entry_lines[entry[2]][int(entry[3])]}: {entry[1]}{problem[entry.end() :]}" if entry else problem
