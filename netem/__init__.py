@@ -1,8 +1,8 @@
 """Control the packets between vehicles: network conditions, a virtual network, and the kernel mechanisms that apply the
 conditions.
 
-`__all__` lists the public names. Python imports a public name only when a program first uses it. The first process of
-every lab imports this package, and this process therefore starts faster.
+`__all__` lists the public names. The first process of every lab imports this package. To let this process start faster,
+Python imports a public name only when a program first uses the name.
 """
 
 from typing import TYPE_CHECKING

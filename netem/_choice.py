@@ -1,5 +1,5 @@
-"""Choose the kernel mechanism (engine) that applies network conditions. This is the engine that the caller requests.
-Without a request, it is the first engine that works on this machine.
+"""Choose the kernel mechanism (engine) that applies network conditions. If the caller requests an engine, only this
+engine is tried. Otherwise the module chooses the first engine that works on this machine.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ def choose(preference: str | None, fabric: VirtualSwitch, needs: Sequence[str] =
     """Install the first suitable engine that works on this machine. Return the engine, and a text with the reason for
     the choice.
 
-    `preference` is the only engine to try. If it is None, the function tries tc netem first, because this engine
-    supports more conditions. `needs` lists the conditions other than loss and partition that the engine must support.
-    The function installs each engine to test it, because no other test shows whether the kernel supports the engine.
-    Raises EngineError if no engine works. The error has the reason for each engine.
+    `preference` is the only engine to try. If it is None, the function tries tc netem first, because tc netem supports
+    more conditions than nftables. `needs` lists the conditions other than loss and partition that the engine must
+    support. The function installs each engine to test it, because no other test shows whether the kernel supports the
+    engine. Raises EngineError if no engine works. Its message contains the reason for each engine.
     """
     engines: dict[str, type[Engine]] = {kind.name: kind for kind in (NetemEngine, NftablesEngine)}
     if preference is not None and preference not in engines:

@@ -119,7 +119,9 @@ def _forwards(port: bytes) -> bool:
 
 
 def flood_broadcasts(port: str, index: int, on: bool) -> NetlinkRequest:
-    """Return a request that changes whether the bridge forwards broadcasts from its other ports to this port."""
+    """Return a request that switches the flooding of broadcasts to one port on or off. While flooding is off, the
+    bridge does not forward broadcasts to this port.
+    """
     flag = nested(_IFLA_PROTINFO, attribute(_IFLA_BRPORT_BCAST_FLOOD, bytes([on])))
     return NetlinkRequest(
         f"set bcast_flood of {port}", RTM_SETLINK, _IFINFOMSG.pack(socket.AF_BRIDGE, 0, index, 0, 0) + flag

@@ -49,7 +49,7 @@ class LabConnection:
         return self._end is None
 
     async def inside(self) -> bool:
-        """Wait for the first report of the process. Return False if the process ends without a report."""
+        """Wait for the first report of the process `netem.init`. Return false if the process ends without a report."""
         return await asyncio.shield(self._inside)
 
     async def ask(self, what: str, **arguments: Any) -> Answer:

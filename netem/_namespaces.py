@@ -76,9 +76,11 @@ def become_root() -> None:
 
 
 def become_first_process(network: int) -> None:
-    """Return in the first process of a PID namespace, which is a grandchild of the calling process. Its network is the
-    network namespace with the file descriptor `network`. The calling process does not return. It waits outside the PID
-    namespace, as `unshare --kill-child` does. Each of these processes ends when its parent ends.
+    """Fork, and return only in the new process. The new process is PID 1 of a new PID namespace, and uses the network
+    namespace with the file descriptor `network`.
+
+    The calling process does not return. It waits outside the PID namespace until the new process ends, as `unshare
+    --kill-child` does. Each of the two processes ends when its parent ends.
     """
     enter_network(network)
     _check(_libc.unshare(_CLONE_NEWNS | _CLONE_NEWPID))
@@ -148,8 +150,8 @@ def not_executed(message: str) -> tuple[str, str] | None:
 
 
 def user() -> str:
-    """Return the user whose rights this process has on the machine, such as "user mail". If the process is root in a
-    user namespace, this is the user that root stands for outside the namespace.
+    """Return the user whose rights this process has on the machine, such as "user mail". In a user namespace, root
+    stands for an ordinary user of the machine. The function then returns this ordinary user.
     """
     uid = os.geteuid()
     for line in Path("/proc/self/uid_map").read_text().splitlines():
@@ -164,7 +166,9 @@ def user() -> str:
 
 
 def way_out(message: str) -> str:
-    """Return advice for the user. `message` is the error with which this machine refused to create namespaces."""
+    """Return advice for a user whose machine cannot create namespaces. `message` is the error that the attempt to
+    create namespaces gave.
+    """
     if "not installed" in message:
         return "Install util-linux (Debian, Ubuntu: apt install util-linux)."
     if not_executed(message):

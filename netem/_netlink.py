@@ -42,7 +42,7 @@ _BATCH_BYTES = 64 << 10  # a socket accepts about three times as much at once
 
 @dataclass(frozen=True)
 class NetlinkRequest:
-    """One request to the kernel. `what` names it in error messages."""
+    """One request to the kernel. `what` is the name of the request in error messages."""
 
     what: str
     type: int

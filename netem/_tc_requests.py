@@ -37,8 +37,8 @@ from netem._netlink import (
 from netem.link import MAX_LIMIT, Delay, Distribution, GilbertElliott, LinkConditions
 
 MAX_KIND = 0x7FFF
-"""Highest number of a traffic class. A netem belongs to each class and needs a number as well. For higher class numbers
-there would be no free number.
+"""Highest number of a traffic class. Each class and the netem inside it need a number of their own. With more classes,
+no number would be left for their netems.
 """
 
 RELAYED = 0x10000
@@ -139,8 +139,8 @@ class TrafficControl:
         return NetlinkRequest("delete class of htb", RTM_DELTCLASS, self._message("htb", _HTB, _HTB | kind))
 
     def mark(self, kind: int, group: int) -> NetlinkRequest:
-        """Return the request that assigns the kind and group of the sender (see `netem.tc`) to packets that enter at
-        this port.
+        """Return the request that makes the kernel mark each packet that enters the switch at this port. The mark
+        contains the kind and the group of the sender (see `netem.tc`).
         """
         parameters = attribute(2, struct.pack("=IIiii", 0, 0, _ACT_OK, 0, 0))
         edit = nested(1, text(1, "skbedit"), nested(2, parameters, number(3, _HTB | kind), number(5, group)))
@@ -148,7 +148,7 @@ class TrafficControl:
         return NetlinkRequest("set filter basic with action skbedit", RTM_NEWTFILTER, message, _SET)
 
     def accept_group(self, group: int) -> NetlinkRequest:
-        """Return the request that lets packets of a group leave at this port."""
+        """Return the request that lets packets of a group leave the switch at this port."""
         return NetlinkRequest(
             "add filter fw", RTM_NEWTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group), NEW
         )
@@ -157,8 +157,8 @@ class TrafficControl:
         return NetlinkRequest("delete filter fw", RTM_DELTFILTER, self._filter("fw", _EGRESS, _ACCEPT_PRIORITY, group))
 
     def read_mark(self, netlink: NetlinkSocket) -> tuple[int, int] | None:
-        """Return (kind, group) of the sender, which the kernel assigns to packets that enter at this port. Return None
-        if it assigns none.
+        """Return (kind, group) from the mark that the kernel sets on packets that enter the switch at this port. Return
+        None if the kernel sets no mark.
         """
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_INGRESS, 0)):
             edit = _inside(parse(entry[_TCMSG.size :]), _OPTIONS, 3, 1, 2)
@@ -168,7 +168,9 @@ class TrafficControl:
         return None
 
     def accepted_groups(self, netlink: NetlinkSocket) -> tuple[set[int], int]:
-        """Return the groups whose packets may leave at this port, and the number of dropped packets of other groups."""
+        """Return the groups whose packets may leave the switch at this port, and the number of packets of other groups
+        that were dropped at this port.
+        """
         groups = set()
         cut = 0
         for entry in netlink.dump("list filters", RTM_GETTFILTER, self._header(_EGRESS, 0)):

@@ -26,8 +26,8 @@ from netem.errors import UmlError
 
 SOURCE = Path(__file__).with_name("uml_registers.c")
 FORCE = "UCP_UML_REGISTERS"
-"""Environment variable that makes the harness preload the library on any processor. The library then has no visible
-effect.
+"""Environment variable that makes the harness preload the library even on a processor that does not need the library.
+On such a processor, programs behave the same with and without the library.
 """
 
 _FIXED_IN = (6, 13)

@@ -26,9 +26,10 @@ __all__ = ["Delay", "Distribution", "GilbertElliott", "LinkConditions", "Network
 class NetworkConditions:
     """The network conditions of all links at one time.
 
-    The conditions of a packet are the first match among `links` (by sender and receiver), `receivers` (by receiving
-    vehicle), and `default`. They are not combined. `partition` holds disjoint groups of vehicle IDs that cannot reach
-    each other; an empty tuple means no partition.
+    The first match among `links` (by sender and receiver), `receivers` (by receiver) and `default` determines the
+    conditions of a packet. The conditions of different matches are not combined. `partition` contains disjoint groups
+    of vehicle IDs. Vehicles of different groups cannot reach each other. An empty tuple means that there is no
+    partition.
     """
 
     default: LinkConditions = field(default_factory=LinkConditions)
@@ -82,8 +83,8 @@ class NetworkConditions:
 
     def needs(self) -> tuple[str, ...]:
         """Return the names of all network conditions in use, other than independent loss and partition. Each condition
-        occurs once. Its name includes the first receiver or link that uses it, for example "receivers 3 reorder" or
-        "links 1>2 delay". A name such as "delay" stands for the default conditions.
+        occurs once. If the default conditions use it, its name is a word such as "delay". Otherwise the name includes
+        the first receiver or link that uses the condition, for example "receivers 3 reorder" or "links 1>2 delay".
         """
         asked = {key: key for key in self.default.needs()}
         for vehicle, link in self.receivers.items():
@@ -93,16 +94,16 @@ class NetworkConditions:
         return tuple(asked.values())
 
     def differing_links(self) -> Iterator[tuple[int, int, LinkConditions]]:
-        """Yield (sender, receiver, conditions) for each link whose network conditions differ from those of the other
-        links to its receiver.
+        """Yield (sender, receiver, conditions) for each link whose network conditions differ from the usual conditions
+        of its receiver.
         """
         for (sender, receiver), link in self.links.items():
             if link != self.receivers.get(receiver, self.default):
                 yield sender, receiver, link
 
     def groups(self, vehicles: Iterable[int]) -> tuple[frozenset[int], ...]:
-        """Return the groups of these vehicles. Vehicles in no group form the last group. Without a partition, return
-        one group.
+        """Divide these vehicles into the groups of the partition, and return the groups. Vehicles in no group form the
+        last group. Without a partition, return all vehicles as one group.
         """
         members: dict[int, set[int]] = {}
         for vehicle in vehicles:
@@ -162,7 +163,7 @@ class NetworkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> NetworkConditions:
-        """Return the network conditions in a JSON object in the format of `to_json`. Raises ConditionsError."""
+        """Create the network conditions from a JSON object in the format of `to_json`. Raises ConditionsError."""
         keywords(cls, value)
         return cls(
             LinkConditions.from_json(value.get("default", {})),

@@ -54,8 +54,8 @@ class ReceiverFigures:
 
     @classmethod
     def of(cls, held: Mapping[int, LinkConditions], cut_from: tuple[int, ...], *counts: int) -> ReceiverFigures:
-        """Return the object for one receiver. `held` maps each sender to the network conditions of its packets. The
-        most frequent conditions become `link`.
+        """Create the object for one receiver. `held` maps each sender to the network conditions of its packets. The
+        conditions that occur most often become `link`.
         """
         ((usual, _),) = Counter(held.values()).most_common(1) or [(LinkConditions(), 0)]
         differing = {sender: link for sender, link in held.items() if link != usual}
@@ -77,7 +77,7 @@ class ReceiverFigures:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ReceiverFigures:
-        """Return the object in this JSON object, which has the format of `to_json`."""
+        """Create the object from a JSON object in the format of `to_json`."""
         own = {field.name for field in fields(cls)}
         return cls(
             LinkConditions.from_json({key: figure for key, figure in value.items() if key not in own}),
@@ -100,7 +100,7 @@ class AppliedConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> AppliedConditions:
-        """Return the object in this JSON object, which has the format of `to_json`."""
+        """Create the object from a JSON object in the format of `to_json`."""
         figures = {int(vehicle): ReceiverFigures.from_json(entry) for vehicle, entry in value["receivers"].items()}
         return cls(value["engine"], figures)
 

@@ -134,9 +134,12 @@ def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
 
 
 def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
-    """Estimate the limit of the delay queue. The limit is the number of packets in the queue when a packet is lost. At
-    this time, packets whose delay is not over are certainly in the queue. Packets that have not arrived yet may be in
-    the queue. The limits of the estimate are the medians of these two numbers over all lost packets.
+    """Estimate the limit of the delay queue: the number of packets in the queue at the time when a further packet is
+    lost.
+
+    For each lost packet, the function computes a lower and an upper bound of this number. Packets whose delay is not
+    over are certainly in the queue. Packets that have not arrived yet may be in the queue. The limits of the estimate
+    are the medians of the lower and of the upper bounds.
     """
     received_packets = dict(received.arrivals)
     must: list[int] = []
@@ -169,8 +172,8 @@ def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
 
 
 def mean(values: Sequence[float], *, packets: int | None = None) -> Estimate:
-    """Estimate the mean of independent values. `packets` is the number of packets that gave these values. By default,
-    each packet gave one value.
+    """Estimate the mean of independent values. `packets` is the number of packets from which the values were computed.
+    By default, each value comes from one packet.
     """
     if len(values) < 2:
         return _NOTHING
@@ -194,8 +197,8 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the number of independent draws that one draw of this sequence of losses is worth. It is (1 - c) / (1 +
-    c), where c is the correlation of successive losses.
+    """Return the number of independent draws that one draw counts as, because losses in bursts are correlated. It is (1
+    - c) / (1 + c), where c is the correlation of successive losses in this sequence.
     """
     loss = fmean(losses)
     if not 0 < loss < 1:

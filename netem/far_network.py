@@ -80,8 +80,9 @@ def create_network() -> int:
 
 
 def become_first_process(network: int) -> None:
-    """Enter a network of `create_network`, and return in a process that is PID 1 of its own PID namespace. It is a
-    grandchild of the calling process. Each of these processes ends when its parent ends.
+    """Enter the network that `create_network` returned. Then fork, and return only in the new process, which is PID 1
+    of a new PID namespace. The calling process waits until the new process ends. Each of the two processes ends when
+    its parent ends.
     """
     _namespaces.become_first_process(network)
 

@@ -49,7 +49,9 @@ _CLOSE_DEADLINE_S = 5.0
 
 
 class RunningProgram(ABC):
-    """A program that can be waited for, and controlled with signals. `send_signal` depends on where it runs."""
+    """A program that runs. Other code can wait for its end, and control it with signals. Subclasses implement
+    `send_signal`, because the way to send a signal depends on the place where the program runs.
+    """
 
     left_behind: tuple[str, ...] = ()
     """Names of child processes that ended with the program. Always empty, because only containers know these names."""
@@ -70,8 +72,8 @@ class RunningProgram(ABC):
         return in_words(self._ended.result())
 
     async def wait(self) -> int:
-        """Wait until the program ends, and return the return code. The return code is -SIGKILL if the program ended
-        with its network or its computer.
+        """Wait until the program ends, and return the return code. If the network or the computer of the program ended
+        together with it, the return code is -SIGKILL.
         """
         return await asyncio.shield(self._ended)
 
@@ -238,8 +240,8 @@ class Lab:
 
     @property
     def network(self) -> Self:
-        """This virtual network itself. The class for containers also has this property, and returns the virtual network
-        that connects its containers.
+        """This virtual network itself. The property exists because the class for containers has a property of the same
+        name, which returns the virtual network between its containers.
         """
         return self
 

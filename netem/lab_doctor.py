@@ -21,8 +21,8 @@ from netem.lab import Lab, LabError
 @dataclass(frozen=True)
 class LabRequirement:
     """A requirement of the virtual network, with an observation that shows whether this machine meets it, and a remedy.
-
-    A machine that does not meet a `needed` requirement cannot open a lab. One working engine is enough.
+    A machine that does not meet a `needed` requirement cannot open a lab. A single engine is not `needed`, because one
+    of the two engines is enough.
     """
 
     name: str

@@ -21,8 +21,8 @@ MAX_DELAY_S = 60.0
 ns ticks)."""
 
 MAX_LIMIT = 100_000
-"""Greatest value of `limit`, the maximum number of waiting packets. Without `limit`, the kernel lets one packet more
-wait, so that a flood of packets cannot fill its memory.
+"""Greatest value of `limit`, the maximum number of waiting packets. If a link has no `limit`, the kernel lets at most
+MAX_LIMIT + 1 packets wait, so that a flood of packets cannot fill its memory.
 """
 
 
@@ -59,7 +59,7 @@ class GilbertElliott:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> GilbertElliott:
-        """Return the model in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
+        """Create the model from a JSON object in the format of `to_json`. Raises ConditionsError."""
         return cls(**keywords(cls, value, "loss", required=("p", "r")))
 
 
@@ -100,7 +100,7 @@ class Delay:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Delay:
-        """Return the delay in this JSON object, which has the format of `to_json`. Raises ConditionsError."""
+        """Create the delay from a JSON object in the format of `to_json`. Raises ConditionsError."""
         return cls(**keywords(cls, value, "delay", required=("mean_s",)))
 
 
@@ -172,7 +172,7 @@ class LinkConditions:
 
     @property
     def independent_loss(self) -> float:
-        """The loss rate, the same for each packet. Raises ConditionsError for loss in bursts."""
+        """The loss rate, if the loss of each packet is independent. Raises ConditionsError for loss in bursts."""
         if isinstance(self.loss, GilbertElliott):
             raise ConditionsError(f"loss: {self.loss} is in bursts; allowed here is a probability 0..1")
         return self.loss
@@ -214,7 +214,7 @@ class LinkConditions:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> LinkConditions:
-        """Return the network conditions in a JSON object in the format of `to_json`. Raises ConditionsError."""
+        """Create the network conditions from a JSON object in the format of `to_json`. Raises ConditionsError."""
         known = keywords(cls, value)
         for key, kind in (("loss", GilbertElliott), ("delay", Delay)):
             if isinstance(known.get(key), Mapping):

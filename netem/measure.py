@@ -251,7 +251,9 @@ def _duplicates() -> list[_LinkCase]:
 
 
 def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
-    """Return a measurement with one sender. It has one receiver for each case."""
+    """Return a measurement with one sender and several receivers. Each receiver has the network conditions of one
+    case.
+    """
     numbered = dict(enumerate(cases, _FIRST_FREE))
     questions = [
         MeasuredQuantity(_SENDER, receiver, case.condition, *figure)
@@ -263,8 +265,8 @@ def _receivers(cases: Sequence[_LinkCase]) -> NetworkStudy:
 
 
 def _pairs() -> NetworkStudy:
-    """Return a measurement with two simultaneous senders. Some links have their own loss, and a partition separates one
-    vehicle.
+    """Return a measurement with two senders that send at the same time. The link between the two senders has a
+    different loss in each direction, and a partition separates one vehicle from all others.
     """
     there, back, rest = 0.4, 0.1, 0.2
     conditions = NetworkConditions(

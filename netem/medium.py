@@ -147,8 +147,8 @@ class _SenderLinks(Protocol):
 
 
 _Way = tuple[int, float, float]
-"""A link as three numbers. A packet is lost if its random number is below the first one. Its delay in seconds is the
-second number, plus the third number multiplied by another random number.
+"""A link as three numbers: (threshold, base, factor). A packet is lost if its first random number is below the
+threshold. Otherwise its delay in seconds is the base plus the factor multiplied by its second random number.
 """
 
 _NO_WAY: _Way = (_WORD, 0.0, 0.0)
@@ -296,10 +296,8 @@ corruption, reordering, latency.
 
 
 class _Link:
-    """The link from one sender to one receiver, with its state between packets.
-
-    `before` is the link under the previous conditions. Its queue is kept if the old and the new conditions both need a
-    queue.
+    """The link from one sender to one receiver, with its state between packets. `before` is the link under the previous
+    conditions. The new link takes over the queue of `before` if both the old and the new conditions need a queue.
     """
 
     def __init__(self, conditions: LinkConditions, before: _Link | None, latency: Delay = LATENCY) -> None:

@@ -64,12 +64,12 @@ def in_medium(seed: int) -> Observer:
 
 
 def in_lab(engine: EngineName) -> Observer:
-    """Return a function that observes real packets. Each call opens a new virtual network.
+    """Return a function that observes real packets. Each call of this function opens a new virtual network.
 
-    If the kernel's engine passed more packets than arrived, the machine lost them, because a receive buffer or a
-    processor's backlog was full. A stream with such losses is useless for the measurement. The function then sends a
-    new stream more slowly. Raises LabError if packets are still lost or the lab fails, and LabUnavailable if this
-    machine cannot run the lab.
+    If the engine counted more passed packets than arrived, the machine lost packets, because a receive buffer or the
+    backlog of a processor was full. Such a stream cannot be used for the measurement, and the function sends a new
+    stream more slowly. Raises LabError if packets are still lost or the lab fails, and LabUnavailable if this machine
+    cannot run the lab.
     """
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:
@@ -141,8 +141,8 @@ def check(
     received_packets: Mapping[tuple[int, int], Sequence[PacketArrival]],
     counted: AppliedConditions,
 ) -> None:
-    """Raise DisturbedError if the machine lost packets. Do not check streams with corrupted packets, because the cause
-    of a loss is unknown there.
+    """Raise DisturbedError if the machine itself lost packets. Streams with corrupted packets are not checked, because
+    their receivers also discard packets, so the cause of a loss is unknown.
     """
     for vehicle, report in reports.items():
         links = [link for link in received_packets if link[1] == vehicle]
@@ -162,8 +162,8 @@ class PacketArrival(NamedTuple):
 
 
 def _arrivals(report: Mapping[str, Any], own: range) -> list[PacketArrival]:
-    """Return the received packets of one sender, numbered from 0. `own` contains the original numbers of this sender's
-    packets.
+    """Return the received packets of one sender, numbered from 0. In the report of the receiver, the packets of all
+    senders are numbered together. `own` is the range of numbers that belongs to this sender.
     """
     each = zip(report["numbers"], report["at_s"], report["delays_s"], strict=True)
     return [PacketArrival(number - own.start, at_s - delay_s, at_s) for number, at_s, delay_s in each if number in own]
@@ -179,7 +179,7 @@ async def _wait_until_quiet(lab: Lab) -> AppliedConditions:
 
 
 class _ProbeProgram:
-    """A program of `netem._probe` that runs in a vehicle."""
+    """A program of `netem._probe` that runs in the network of a vehicle."""
 
     def __init__(self, process: LabProcess, output: Path) -> None:
         self._process = process
@@ -199,12 +199,12 @@ class _ProbeProgram:
             await asyncio.sleep(0.01)
 
     async def stop(self) -> Any:
-        """Let the program end, and return its results."""
+        """End the program with SIGTERM, and return its results."""
         await self._process.send_signal(signal.SIGTERM)
         return await self.end()
 
     async def end(self) -> Any:
-        """Wait until the program ends, and return its results."""
+        """Wait until the program ends by itself, and return its results."""
         status = await self._process.wait()
         last = (self._output.read_text().splitlines() or [""])[-1]
         if status != 0:

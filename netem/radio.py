@@ -18,8 +18,8 @@ MIN_DISTANCE_M = 1.0
 """Reference distance of the path loss models, in metres. Shorter distances are treated like this distance."""
 
 STEPS = 100
-"""Loss rates are rounded to multiples of 1 / this number. Because of the rounding, the small movements of hovering
-vehicles do not change the network conditions.
+"""Number of steps into which the loss rates from 0 to 1 are divided: each loss rate is rounded to a whole multiple of
+1/STEPS. Because of the rounding, small movements of hovering vehicles do not change the network conditions.
 """
 
 

@@ -1,21 +1,21 @@
 """Take broadcasts out of the virtual switch before their delivery, and deliver them one by one.
 
-    relay = Relay([1, 2, 3])        in the lab's own network
-    relay.open()                    the switch no longer floods broadcasts to these vehicles
-    for heard in relay.take(): ...  each broadcast of a vehicle, with the time at which the kernel got it
+    relay = Relay([1, 2, 3])                  in the lab's own network
+    relay.open()                              the switch no longer floods broadcasts to these vehicles
+    for heard in relay.take(): ...            each broadcast of a vehicle, with the time at which the kernel received it
     relay.deliver(2, heard.frame)
 
 `python -m netem.relay 1 2 3` opens and closes a relay, to test whether the kernel supports it.
 
 A simulated radio channel decides when each vehicle receives a broadcast, and which vehicles lose it. A queue of the
 kernel at one port cannot do this. The relay uses two features that every bridge has. A port flag (`bcast_flood`,
-bridge(8)) keeps broadcasts away from the vehicles. A packet socket (packet(7)) gets each broadcast before the bridge
-handles it, and other packet sockets send it to single ports. The vehicles detect no difference, and the switch handles
-all other packets as before. A capture at a port contains the frames that the vehicle sent, and the frames that the
-relay delivered to the vehicle.
+bridge(8)) keeps broadcasts away from the vehicles. A packet socket (packet(7)) receives each broadcast before the
+bridge handles it. Other packet sockets send the broadcast to single ports.
 
-Frames keep the header of `PACKET_VNET_HDR`, which marks their checksum as missing. The kernel therefore never computes
-the checksum. Delivered frames have a packet mark, and every engine lets frames with this mark pass.
+The vehicles detect no difference, and the switch handles all other packets as before. A capture at a port contains the
+frames that the vehicle sent, and the frames that the relay delivered to the vehicle. Frames keep the header of
+`PACKET_VNET_HDR`. This header marks the checksum of a frame as missing, so that the kernel need not compute it.
+Delivered frames have a packet mark, and every engine lets frames with this mark pass.
 """
 
 from __future__ import annotations
@@ -89,11 +89,11 @@ class ReceivedBroadcast:
 
 
 class Relay:
-    """A relay that takes the broadcasts to these vehicles out of the switch between `open` and `close`. Raises OSError
-    if packet sockets are not available.
+    """A relay for the broadcasts to the vehicles in `vehicles`. From `open` to `close`, the switch does not deliver
+    broadcasts to these vehicles. Raises OSError if packet sockets are not available.
 
-    `others` are further vehicles of the lab. The relay takes their broadcasts too. The switch still delivers the
-    broadcasts of all vehicles to these other vehicles.
+    `others` are further vehicles of the lab. The relay also reads the broadcasts that they send, but the switch still
+    delivers all broadcasts to them.
     """
 
     def __init__(self, vehicles: Sequence[int], others: Sequence[int] = ()) -> None:

@@ -216,7 +216,9 @@ class NetemEngine(Engine):
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
-        """Return the mark of packets that enter at each port, and the groups whose packets may leave there."""
+        """Return two mappings by vehicle: the mark of the packets that this vehicle sends, and the groups whose packets
+        may reach this vehicle, with the number of packets that were dropped.
+        """
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}
 
@@ -257,8 +259,8 @@ class NetemEngine(Engine):
         return ReceiverFigures.of(held, tuple(cut_from), passed, lost, cut)
 
     def _with_distribution(self, link: LinkConditions, receiver: int, kind: int) -> LinkConditions:
-        """Return the network conditions that the kernel reports, and add the distribution of the delay, which the
-        kernel omits.
+        """Add the distribution of the delay to the network conditions that the kernel reports, because the kernel does
+        not report the distribution.
         """
         holds = self._classes[receiver].get(kind)
         if link.delay is None or not link.delay.jitter_s or holds is None or holds.distribution == "uniform":
@@ -285,9 +287,9 @@ def _kinds(conditions: NetworkConditions, vehicles: tuple[int, ...]) -> list[fro
 
 
 def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> dict[int, LinkConditions]:
-    """Return number of a kind of senders -> network conditions of this receiver for these senders.
-
-    Kinds without a sender other than the receiver are omitted, unless no other kind exists.
+    """Return the network conditions of each traffic class at this receiver's port, by the number of the class. Each
+    class belongs to one kind of senders. A kind whose only sender is the receiver itself is omitted, unless no other
+    kind exists.
     """
     senders = {number: next((v for v in kind if v != receiver), None) for kind, number in kinds.items()}
     links = {n: conditions.link(sender, receiver) for n, sender in senders.items() if sender is not None}
@@ -295,7 +297,9 @@ def _classes(conditions: NetworkConditions, kinds: _Numbers, receiver: int) -> d
 
 
 def _number(sets: Iterable[frozenset[int]], before: _Numbers, taken: Iterable[int]) -> _Numbers:
-    """Assign numbers to sets of vehicles. A set that already had a number keeps it."""
+    """Assign a number to each set of vehicles. Sets in `before` keep their numbers. The numbers in `taken` are not used
+    for other sets.
+    """
     used = {*taken, *before.values()}
     free = (number for number in range(1, MAX_KIND) if number not in used)
     return {members: before[members] if members in before else next(free) for members in sets}

@@ -190,10 +190,9 @@ def _init(command: Path) -> str:
 
 
 class _RunningKernel:
-    """A running User Mode Linux. The caller must call `end`.
-
-    Its consoles write to files in `folder`, which are read while they grow. Pipes are unsuitable, because this kernel's
-    consoles drop output if a pipe is full.
+    """A running User Mode Linux. The caller must call `end`. The consoles of the kernel write to files in `folder`, and
+    this class reads the files while they grow. Pipes are unsuitable, because a console drops output if its pipe is
+    full.
     """
 
     def __init__(self, kernel: Path, folder: Path, preload: Mapping[str, str]) -> None:

@@ -99,7 +99,9 @@ def _script(token: str, argv: Sequence[str], cwd: Path, env: Mapping[str, str]) 
 
 
 def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) -> int:
-    """Copy input to the virtual machine, and copy its output between the start and end marks."""
+    """Copy input to the virtual machine, and copy the output of the program, which begins after the start mark and ends
+    at the end mark. Return the exit status of the program.
+    """
     output, started = b"", False
     typing = sys.stdin.isatty()
     requested_at = -math.inf
@@ -131,7 +133,9 @@ def _copy_until_end(folder: Path, token: bytes, keys: int, screen: io.FileIO) ->
 
 
 def _certain_length(output: bytes) -> int:
-    """Return the number of bytes at the beginning of `output` that cannot belong to the end mark."""
+    """Return the number of bytes at the beginning of `output` that certainly belong to the output of the program. The
+    bytes after them may be a part of the end mark.
+    """
     at = output.rfind(b"\0", -END_MARK_BYTES)
     return at if at >= 0 else len(output)
 

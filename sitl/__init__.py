@@ -1,7 +1,7 @@
 """Run simulated vehicles: ArduPilot SITL or the embedded vehicle model, and a pilot that flies them over MAVLink.
 
-`__all__` lists the public names. Python imports a public name only when a program first uses it. Every embedded vehicle
-imports this package, and it therefore starts faster.
+`__all__` lists the public names. Every embedded vehicle imports this package. To let the vehicles start faster, Python
+imports a public name only when a program first uses the name.
 """
 
 from typing import TYPE_CHECKING

@@ -106,8 +106,8 @@ class GuidedFlight:
         return is_near(place, waypoint, self._to.vehicle_type)
 
     def _on_its_way(self) -> bool:
-        """Return true if the vehicle has accepted its target. A plane accepts the target with an acknowledgement. Other
-        vehicles send none, so the function checks whether they move.
+        """Return true if the vehicle has accepted its target. A plane acknowledges its target. A copter or a rover
+        sends no acknowledgement, so the function checks whether the vehicle moves or has already reached the target.
         """
         if self._to.vehicle_type == "plane":
             return self._to.accepted(mavlink.MAV_CMD_DO_REPOSITION)

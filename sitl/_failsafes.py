@@ -33,8 +33,8 @@ ACTIONS: dict[VehicleType, dict[float, str]] = {
     "plane": {1: "RTL", 2: "RTL"},
     "rover": {1: "RTL", 2: "HOLD", 3: "RTL", 4: "HOLD"},
 }
-"""Value of a parameter BATT_FS_..._ACT -> mode that the vehicle enters. Other values select no mode. Some values prefer
-another route home, which this vehicle does not have.
+"""Value of a parameter BATT_FS_..._ACT -> mode that the vehicle enters. A value that is not listed selects no mode. In
+ArduPilot, some of the listed values select another route home. The embedded vehicle has no other route.
 """
 
 RC_FAIL, RC_SILENT_S = "SIM_RC_FAIL", 1.0
@@ -51,8 +51,8 @@ LINKS: dict[VehicleType, dict[str, float]] = {
 In ArduPlane, the timeout has the name FS_LONG_TIMEOUT.
 """
 LINK_ACTION: dict[VehicleType, str] = {"plane": "FS_LONG_ACTN", "rover": "FS_ACTION"}
-"""The parameter that selects the action of both failsafes. A copter has no such parameter. The parameters that enable
-its failsafes also select the action.
+"""Parameter that selects the action of both failsafes in `LINKS`. A copter has no such parameter, because the
+parameters that enable its failsafes also select the action.
 """
 STATION_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "RTL", 4.0: "LAND", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
 RC_ACTIONS = {1.0: "RTL", 2.0: "RTL", 3.0: "LAND", 4.0: "RTL", 5.0: "LAND", 6.0: "RTL", 7.0: "LAND"}
@@ -85,7 +85,7 @@ class Failsafes:
         if vehicle_type == "plane":
             self.parameters |= {WIND: 0.0, WIND_FROM: 180.0}
         self.acting: list[Failsafe] = []
-        """Failsafes that have acted, and whose cause still exists, so that they do not act again."""
+        """Failsafes that have acted, and whose cause still exists. A failsafe in this list does not act again."""
         self._since_s: dict[Failsafe, float] = {}
         """Failsafe -> the time at which its cause began. Only failsafes that have not acted yet are included."""
 

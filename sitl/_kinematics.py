@@ -211,7 +211,7 @@ class PlannedMotion:
 
 
 class MotionInterval:
-    """A part of a motion, from `begin_s` to `end_s` on its clock."""
+    """A part of the motion `course`, from `begin_s` to `end_s` on the clock of `course`."""
 
     def __init__(self, course: PlannedMotion, begin_s: float, end_s: float) -> None:
         self._course, self._begin_s = course, begin_s

@@ -33,8 +33,8 @@ class FrameSplitter:
 
 
 def _length(stream: bytes, at: int) -> int | None:
-    """Return the length of the frame that begins here. Return None if no frame begins here or its length is not known
-    yet.
+    """Return the length of the frame that begins at position `at` of the stream. Return None if no frame begins at this
+    position, or if the length is not known yet.
     """
     if stream[at] == _V2:
         return 12 + stream[at + 1] + 13 * (stream[at + 2] & _SIGNED)

@@ -40,7 +40,7 @@ class MotionModel(Protocol):
         """
 
     def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
-        """Land at `place`, and stop there. `before` is used as in `go_to`."""
+        """Land at `place`, and stop at this place. `before` is the previous place, as in `go_to`."""
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
         """Take off without a mission. Then stay, or circle if the vehicle is a plane, without end."""
@@ -54,6 +54,6 @@ AT_ONCE: dict[VehicleType, MotionModel] = {
     "plane": PlaneMotion(),
     "rover": RoverMotion(start_s=0.0, corner_rads=TURN_RATE_RADS),
 }
-"""Type of vehicle -> its motion outside of missions: in GUIDED mode, and during a commanded landing. It reacts to
-commands without the delays that smooth a path in AUTO mode.
+"""Type of vehicle -> its motion outside of missions: in GUIDED mode, and during a commanded landing. The vehicle then
+reacts to commands at once. In AUTO mode it reacts with a delay, because ArduPilot smooths the path.
 """

@@ -45,8 +45,8 @@ _ADDRESS = frozenset({"target_system", "target_component", "command", "mavpacket
 
 
 class CommandLog:
-    """The recorded commands in order. Equal consecutive commands form one entry, which contains their number and the
-    time of the last command.
+    """The recorded commands in order. Equal consecutive commands form one entry, which contains the number of these
+    commands and the time of the last one.
     """
 
     def __init__(self) -> None:
@@ -91,8 +91,8 @@ def _command(message: Any) -> str | None:
 
 
 def _values(message: Any) -> dict[str, object]:
-    """Return the fields of the message as JSON values, without its address. The result is empty for joystick
-    messages.
+    """Return the fields of the message as JSON values, without the fields that contain the address of the vehicle. For
+    a joystick message, the result is empty.
     """
     if message.get_type() in _AT_THE_STICKS:
         return {}

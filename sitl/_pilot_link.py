@@ -68,13 +68,15 @@ class PilotLink(asyncio.Protocol):
         self.heard = asyncio.Event()
         """An event that is set when data arrives, and when the connection ends."""
         self.heard_at = time.monotonic()
-        """Time of the last data from the vehicle. This time and the next two are values of time.monotonic()."""
+        """Time of the last data from the vehicle. `heard_at`, `heartbeat_at` and `position_at` are values of
+        time.monotonic().
+        """
         self.heartbeat_at: float | None = None
         self.position_at: float | None = None
         self.heartbeats = 0
         self.plays_station = self.station_is_heard = True
-        """`plays_station` is false if the run has a real ground station. While either of the two values is false, the
-        link sends no heartbeats of a ground station.
+        """`plays_station` is false if the run has a real ground station. `station_is_heard` is false while the loss of
+        the ground station is simulated. The link sends heartbeats of a ground station only while both values are true.
         """
         self.foreign_sysid: int | None = None
         self.acks: dict[int, int] = {}  # MAV_CMD: the last MAV_RESULT

@@ -66,7 +66,9 @@ class PlaneMotion:
         return [*run, *path.segments]
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off as in mode TAKEOFF: fly to the left side of a circle ahead, and then circle without end."""
+        """Take off as in mode TAKEOFF: fly to the left edge of a circle that lies ahead, and then fly along this circle
+        without end.
+        """
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _point_ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
@@ -102,9 +104,8 @@ class PlaneMotion:
         return path.segments
 
     def land(self, start: MotionState, place: LocalPlace, before: LocalPlace | None = None) -> Sequence[MotionSegment]:
-        """Glide straight to the ground before the place, and roll to a stop.
-
-        A plane that is too high circles down first.
+        """Glide in a straight line to a point on the ground that lies between the plane and `place`. Then roll, and
+        stop near `place`. A plane that is too high circles down first.
         """
         touchdown = _towards(place, start.point, ROLL_OUT_M)._replace(up_m=0.0)
         glide_s = _duration_s(_back_and_on(start, touchdown, before, LANDING_MS, 0.0, 0.0))
@@ -260,8 +261,8 @@ def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather
 
 
 def _back_on_line(here: LocalPlace, before: LocalPlace, place: LocalPlace) -> LocalPlace | None:
-    """Return the point on the line between two places towards which the plane flies to return to the line. Return None
-    if the plane can fly directly to the second place.
+    """Return the point to which the plane flies to return to the line from `before` to `place`. The point is on this
+    line. Return None if the plane can fly directly to `place`.
     """
     north, east = place.north_m - before.north_m, place.east_m - before.east_m
     length_m = math.hypot(north, east)
@@ -285,8 +286,8 @@ def _on_circle(place: LocalPlace, radius_m: float, bearing_rad: float) -> LocalP
 
 
 def _towards(place: LocalPlace, other: LocalPlace, length_m: float) -> LocalPlace:
-    """Return the point on the line from `place` to `other` that is `length_m` away from `place`. If `other` is nearer,
-    return `other`.
+    """Return the point that lies `length_m` from `place` in the direction of `other`. If `other` is nearer than
+    `length_m`, return `other`.
     """
     away_m = max(math.dist(place[:2], other[:2]), NEAR_M)
     part = min(1.0, length_m / away_m)

@@ -101,9 +101,8 @@ def landing_begins(waypoints: Sequence[Waypoint], vehicle_type: VehicleType) -> 
 
 
 def _approach(place: LocalPlace, heading_deg: float) -> LocalPlace:
-    """Return the place at which a plane begins to land at `place`.
-
-    This place is before the landing on the line of the runway, which has the heading of home.
+    """Return the place at which a plane begins its approach to the landing at `place`. The plane then flies along the
+    runway, in the direction of home's heading, until it reaches `place`.
     """
     before_m, heading = place.up_m / APPROACH_SLOPE, math.radians(heading_deg)
     return LocalPlace(

@@ -36,9 +36,8 @@ class Airframe:
 
 
 def airframe(name: str | None, vehicle_type: VehicleType) -> Airframe:
-    """Return the frame with this name. If the name is None, return the default frame of the vehicle type.
-
-    Raises VehicleError if no frame has this name. The error names the nearest frame of the type.
+    """Return the frame with this name. If the name is None, return the default frame of the vehicle type. Raises
+    VehicleError if no frame has this name. The error message suggests a frame with a similar name.
     """
     if name is None:
         name = USUAL[vehicle_type]
@@ -148,8 +147,8 @@ _TABLE = _table()
 
 
 def stacked(vehicle_type: VehicleType) -> list[str]:
-    """Return the names of the parameter files that frames of this vehicle type use in addition to the usual file of the
-    type. Frames that need a different program than the usual one are ignored.
+    """Return the names of all parameter files that frames of this vehicle type need in addition to the usual file of
+    the type. A frame that needs its own ArduPilot program is ignored.
     """
     program, own = BINARIES[vehicle_type], DEFAULTS[vehicle_type]
     frames = (frame for frame in _TABLE.values() if frame.program == program)

@@ -71,8 +71,8 @@ class Embedded:
             raise VehicleError(f"embedded vehicles have no {' and no '.join(lacks)}: fly ArduPilot, or leave it out")
 
     def launch(self, sysid: int, home: Home, speedup: float, directory: Path) -> Launch:
-        """Return the command that starts the embedded vehicle. It writes no files to `directory`. Raises
-        VehicleError.
+        """Return the command that starts the embedded vehicle. The embedded vehicle needs no files in `directory`.
+        Raises VehicleError.
         """
         check_launch(sysid, home, speedup)
         return Launch(

@@ -42,7 +42,9 @@ SOURCE = "https://raw.githubusercontent.com"
 LIMIT = 100_000_000  # bytes; a binary has about 7 MB
 TEXT_LIMIT = 1_000_000  # bytes
 HELP_S = 10.0
-"""Time limit in seconds for `--help`. If a program still runs after this time, this machine can run it."""
+"""Time limit in seconds for a test run of a program with `--help`. A program that still runs after this time has
+started, so this machine can run it.
+"""
 
 # Where the source tree keeps a vehicle's defaults; the plane's have moved.
 _AUTOTEST = "Tools/autotest"
@@ -94,7 +96,7 @@ class InstallWatcher(Protocol):
 
 @dataclass(frozen=True)
 class InstallOutcome:
-    """The installed version, and true if it was already installed."""
+    """The result of an installation. `installed` is the version. `already` is true if it had been installed before."""
 
     installed: InstalledVersion
     already: bool
@@ -256,7 +258,9 @@ class _ReleaseServer:
 
 
 def _refuse_what_does_not_run(program: Path) -> None:
-    """Raise VehicleError if this aarch64 machine cannot run 32-bit programs."""
+    """Raise VehicleError if this machine cannot run the program because it is an aarch64 machine without support for
+    32-bit programs.
+    """
     try:
         subprocess.run([program, "--help"], capture_output=True, timeout=HELP_S, stdin=subprocess.DEVNULL, check=False)
     except subprocess.TimeoutExpired:

@@ -43,7 +43,9 @@ class DownloadedFile:
 
 @dataclass(frozen=True)
 class DownloadManifest:
-    """The list of downloaded files, with ArduPilot's version and git commit, and the time (ISO 8601, UTC)."""
+    """The list of downloaded files, with ArduPilot's version and git commit. `fetched_at` is the time of the download
+    (ISO 8601, UTC).
+    """
 
     vehicle: str
     version: str

@@ -69,9 +69,8 @@ def check(values: Mapping[str, float]) -> None:
 
 
 def unknown(asked: Iterable[str], known: Iterable[str]) -> str | None:
-    """Return a phrase about the requested parameters that a vehicle does not have, with similar parameters that it has.
-
-    Return None if the vehicle has all of these parameters.
+    """Return a phrase about requested parameters that a vehicle does not have. The phrase suggests a parameter of the
+    vehicle with a similar name. Return None if the vehicle has all requested parameters.
     """
     names = set(known)
     missing = sorted(set(asked) - names)

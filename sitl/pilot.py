@@ -274,9 +274,9 @@ class _StepWaitingTimes:
         return SILENCE_S / min(1.0, self._link.speedup)
 
     def _streams(self) -> dict[str, float]:
-        """Return the time of the last message in each stream: of all messages, of heartbeats, and of positions.
-        Heartbeats and positions are included only if the vehicle has sent any. Each key is the text to report if the
-        stream is silent.
+        """Return the time of the last message of each kind: any message, a heartbeat, or a position. Each key is a
+        phrase that reports silence, such as "it has sent no heartbeat". Heartbeats and positions are omitted until the
+        vehicle has sent one.
         """
         times = {"it has sent no heartbeat": self._link.heartbeat_at, "it has sent no position": self._link.position_at}
         return {"it has been silent": self._link.heard_at, **{what: at for what, at in times.items() if at is not None}}

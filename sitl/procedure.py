@@ -96,7 +96,9 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> ProcedureStep | None:
-        """Return the next step that arms the vehicle. Return None if the vehicle is armed."""
+        """Return the step that must be complete next, so that the vehicle becomes armed. Return None if the vehicle is
+        armed.
+        """
         if self.state.armed:
             return None
         return ARM if self.state.ready_to_arm and self.state.position else READY

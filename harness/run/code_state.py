@@ -163,7 +163,9 @@ class SuspectCommits:
     """The result of a search for the first bad commit."""
 
     first: tuple[str, ...]
-    """Hash of the first bad commit. Several candidates if some commits could not be tested."""
+    """Hash of the first bad commit. If some commits could not be tested, it contains the hashes of several
+    candidates.
+    """
 
 
 class GitBisection:

@@ -58,7 +58,7 @@ def same_judge(recorded: Mapping[str, str]) -> bool:
 
 
 def differing_versions(a: Mapping[str, str], b: Mapping[str, str]) -> list[str]:
-    """Return the names of the versions that differ between two records as text, such as "core x and y"."""
+    """Compare the versions in two records. Return a text for each version that differs, such as "core x and y"."""
     return [
         f"{key} {a.get(key, 'unknown')} and {b.get(key, 'unknown')}"
         for key in ("ucp-harness", "commit", "core", "reference")

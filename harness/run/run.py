@@ -189,7 +189,9 @@ class RunRecording:
         self._update(scenario=scenario)
 
     def record_requests(self, interventions: Interventions) -> None:
-        """Record the actions that the user has requested so far. Also write a scenario file that repeats them."""
+        """Record the actions that the user has requested so far. Also write a scenario file that repeats the run with
+        these actions.
+        """
         self.update_scenario(interventions.scenario)
         by_hand_s = [entry.at_s for entry in interventions.by_hand]
         replay = replay_of(self._record, by_hand_s)

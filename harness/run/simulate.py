@@ -59,14 +59,12 @@ def simulate(
     - `tracing`: record handler runs. Without handler runs, characteristic 1 cannot be judged, and characteristics 2 and
       3 can be judged only at the end of the run.
     - `deliver_all`: also deliver messages that have no effect.
-    - `again`: give foreign agents their inputs a second time, and compare the answers. If the run has a bad verdict,
-      the comparison is always made.
+    - `again`: run foreign agents a second time with the same inputs, and compare their answers with the first ones. If
+      the run has a bad verdict, the comparison is always made.
 
-    If an agent crashes or hangs, the other agents continue. The result has the verdict `ended`, or the verdict `steps`
-    names the handler that did not finish.
-
-    Raises ScenarioError if the scenario needs real processes, and HarnessError if an agent does not support the mission
-    or behaves differently when it gets the same input again.
+    If an agent crashes or hangs, the other agents continue. The result then has the bad verdict `ended`, unless the
+    check `steps` already reports this failure. Raises ScenarioError if the scenario needs real processes, and
+    HarnessError if an agent does not support the mission or behaves differently when it receives the same inputs again.
     """
     return simulate_in_memory(MemoryRecorder(tracing), scenario, seed, again=again, deliver_all=deliver_all)
 

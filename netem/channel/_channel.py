@@ -151,13 +151,11 @@ class Channel:
         self._access.begun(sensed, now)
 
     def _overlap(self, frames: list[RadioFrame], now: int) -> list[RadioFrame]:
-        """Decide which receivers begin to receive each of these frames. For each frame on the air, record the receivers
-        at which other frames disturb it.
+        """Decide which receivers begin to receive each of these frames, and record the receivers at which frames on the
+        air now disturb each other.
 
-        Return the frames that more stations sense from now on than before.
-
-        A frame with power p is strong enough if p >= ratio * (total - p), which is the same as p * (1 + 1 / ratio) >=
-        total.
+        Return the frames that are now sensed by further stations. A frame with power p is strong enough if p >= ratio *
+        (total - p), which is the same as p * (1 + 1 / ratio) >= total.
         """
         for frame in self._active:
             frame.deaf |= frame.reach.heard & self._sending
@@ -181,10 +179,9 @@ class Channel:
         return self._sum_energy(air, totals)
 
     def _sum_energy(self, air: list[RadioFrame], totals: Sequence[float]) -> list[RadioFrame]:
-        """Mark stations at which all frames on the air together reach the detection level. Such a station senses the
-        channel as busy until the sum of the powers falls below the detection level.
-
-        Return the frames that more stations sense from now on than before.
+        """Find the stations at which all frames on the air together reach the detection level. Such a station senses
+        the channel as busy until the sum of the powers falls below the detection level. Return the frames that are now
+        sensed by further stations.
         """
         level = self._energy
         by_end = sorted(air, key=lambda frame: frame.ends_ns, reverse=True)

@@ -41,9 +41,11 @@ class CarrierSense:
         self._eifs = nanoseconds(radio.eifs_s)
         self._sense = nanoseconds(radio.sense_s)
         self._left = [0] * len(draws)
-        """Number of slots that each station has to count down from its time in `_from` on."""
+        """Station -> number of slots that the station must still count down. The countdown starts at the station's time
+        in `_from`.
+        """
         self._from = [0] * len(draws)
-        """The time at which each station begins or began to count down."""
+        """Station -> the time at which its countdown starts or has started."""
         self._resting: dict[int, int] = {}
         """Station without a waiting frame that still counts down after its last frame -> the time at which the
         countdown ends.
@@ -71,8 +73,8 @@ class CarrierSense:
         self.next_due = min(self.next_due, due)
 
     def begun(self, frames: list[RadioFrame], now: int) -> None:
-        """Make each station wait that senses these frames. A station sends nevertheless if its sending time is at most
-        `sense_s` after `now`, because it cannot sense the frames so soon.
+        """Make each station that senses these frames wait. A station whose sending time is at most `sense_s` after
+        `now` sends nevertheless, because it cannot sense the frames so soon.
         """
         all_due, all_from, all_left, slot, notices = self._due, self._from, self._left, self._slot, now + self._sense
         resting = self._resting
@@ -167,8 +169,8 @@ class CarrierSense:
         )
 
     def _idle_from(self, station: int, now: int) -> int:
-        """Return the time at which the channel has been idle long enough after the last frame that the station
-        sensed.
+        """Return the time from which the station may count slots: the end of the last frame that the station sensed,
+        plus DIFS or EIFS. If no such frame ended recently, return `now`.
         """
         for frame in reversed(self._over):
             if frame.sensed >> station & 1:

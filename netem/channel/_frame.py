@@ -54,7 +54,9 @@ class RadioFrame:
     deaf: int = 0
     """Receivers in range that were sending a frame themselves."""
     summed: int = 0
-    """Receivers that sense the total power of overlapping frames until this frame ends."""
+    """Receivers that sense the channel as busy until this frame ends, only because the powers of several frames add
+    up.
+    """
 
     @property
     def sensed(self) -> int:

@@ -28,8 +28,8 @@ from netem.channel._parameters import NANOSECONDS, Radio, nanoseconds
 from netem.radio import MIN_DISTANCE_M, Place
 
 STEP = 0.1
-"""Part of the correlation time and correlation distance after which the shadowing is drawn again. Over the whole time
-or distance, the correlation falls to 1/e. From one draw to the next, it falls to exp(-STEP), about 0.9.
+"""Fraction of the correlation time, and of the correlation distance, after which the shadowing is drawn again. Over the
+complete time or distance, the correlation falls to 1/e. From one draw to the next, it falls to exp(-STEP), about 0.9.
 """
 
 _SILENT = -1_000_000
@@ -191,11 +191,9 @@ class RadioLinks:
         return _MeanReach(levels, near, far, cut)
 
     def _path_loss(self, one: Place, other: Place) -> int:
-        """Return the path loss between two places in 0.01 dB. The result is the path loss of the log-distance model. If
-        the radio has the ground model of two rays over flat ground, the result is the greater path loss of the two
-        models.
-
-        The model of two rays is from Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas.
+        """Return the path loss between two places in 0.01 dB. By default, this is the path loss of the log-distance
+        model. With the ground model `two_ray`, the function also computes the path loss over flat ground, and returns
+        the greater of both (Rappaport, Wireless Communications, 2nd ed., eq. 4.52, far from the antennas).
         """
         radio = self._radio
         metres = max(one.distance_m(other), MIN_DISTANCE_M)
@@ -208,8 +206,8 @@ class RadioLinks:
         return _hundredths_of_db(loss_db)
 
     def _age(self, now_ns: int) -> None:
-        """Replace the shadowing values. How much of the old values remains depends on the time and the movement since
-        the last change.
+        """Replace the shadowing values, because time has passed. The longer the time and the movements since the last
+        change, the smaller is the part of the old values that remains.
         """
         elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
         self._shadowed_at = now_ns
@@ -217,9 +215,9 @@ class RadioLinks:
         self._shift(elapsed_s / self._radio.shadowing_s)
 
     def _shift(self, exponent: float | None) -> None:
-        """Draw new shadowing values in dependence on the old ones. The correlation of new and old values is
-        exp(-`exponent`) if no vehicle has moved, and smaller after movements. If `exponent` is None, the new values do
-        not depend on the old ones.
+        """Draw new shadowing values that are correlated with the old ones. The correlation is exp(-`exponent`) if no
+        vehicle has moved, and smaller after movements. If `exponent` is None, the new values do not depend on the old
+        ones.
         """
         shadow, moved_m = self._shadow, self._moved_m
         known = -1.0

@@ -164,7 +164,7 @@ _RANGES: dict[str, tuple[float, float]] = {
     "symbol_s": (1e-9, MAX_S),
     "turn_s": (1e-9, MAX_S),
 }
-"""Key -> the least and the greatest allowed value. For times that are not listed, these are 0 and MAX_S seconds."""
+"""Key -> the least and the greatest allowed value. A time that is not listed may be 0 to MAX_S seconds."""
 
 
 def _check(key: str, value: object) -> None:
