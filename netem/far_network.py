@@ -60,8 +60,8 @@ def needs_user_namespace() -> bool:
 
 
 def become_keeper(*, user_namespace: bool) -> None:
-    """Let this process create networks with `create_network`. The kernel kills it when its parent ends.
-    `user_namespace` is the result of `needs_user_namespace`. The process must have one thread.
+    """Prepare this process, so that it can create networks with `create_network`. The kernel kills this process when
+    its parent ends. `user_namespace` is the result of `needs_user_namespace`. The process must have one thread.
     """
     if user_namespace:
         _namespaces.become_root()
@@ -125,5 +125,5 @@ class FarNetwork:
         return frame[begin + _UDP_BYTES : begin + int.from_bytes(udp[4:6], "big")]
 
     def write(self, sender: int, data: bytes) -> None:
-        """Let the vehicle receive a datagram of another vehicle. Raises OSError."""
+        """Deliver a datagram of another vehicle to the programs of this vehicle. Raises OSError."""
         os.write(self.descriptor, udp_broadcast(sender, self._port, data))

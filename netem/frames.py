@@ -16,9 +16,10 @@ _TTL = 64
 
 
 def checksum(data: bytes) -> int:
-    """Return the Internet checksum (RFC 1071) as UDP uses it, with 0xFFFF in place of 0. The checksum is a sum of
-    16-bit words with end-around carry. This sum equals the remainder of a division by 0xFFFF, which is faster to
-    compute.
+    """Return the Internet checksum (RFC 1071). If the checksum is 0, return 0xFFFF, as UDP requires.
+
+    The checksum is a sum of 16-bit words with end-around carry. This sum equals the remainder of a division by 0xFFFF,
+    which is faster to compute.
     """
     return 0xFFFF - (int.from_bytes(data, "big") << 8 * (len(data) % 2)) % 0xFFFF
 

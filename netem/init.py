@@ -278,8 +278,8 @@ class LabServer:
     # Children
 
     def _reap(self, _: int) -> None:
-        """Report the child processes that have ended. The kernel also assigns orphaned processes to this process. These
-        are removed without a report.
+        """Report the child processes that have ended. The kernel also makes orphaned processes children of this
+        process. If an orphaned process ends, it is removed without a report.
         """
         with contextlib.suppress(BlockingIOError):
             os.read(self._wake, 4096)

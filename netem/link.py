@@ -67,9 +67,9 @@ class GilbertElliott:
 class Delay:
     """The delay of packets in seconds. Its mean is 0 to 60.
 
-    `jitter_s` is the greatest deviation of a uniform delay, and the standard deviation of the other distributions,
-    which are drawn from netem's tables. It is at most `mean_s`, so a uniform delay is never negative. Negative delays
-    in the tail of the other distributions become 0, as in netem.
+    In the uniform distribution, `jitter_s` is the greatest deviation from the mean. In the other distributions, which
+    are drawn from netem's tables, `jitter_s` is the standard deviation. `jitter_s` is at most `mean_s`, so a uniform
+    delay is never negative. Negative delays in the tail of the other distributions become 0, as in netem.
     """
 
     mean_s: float
@@ -108,11 +108,11 @@ class Delay:
 class LinkConditions:
     """The network conditions of packets to one receiver, from all senders or from one.
 
-    `loss` is the probability, 0 to 1, that a packet is lost, drawn for each packet, or a model of bursts. `duplicate`
-    is the probability that a packet arrives twice. It is drawn together with the loss: if a packet is both lost and
-    duplicated, one copy remains. Otherwise loss and the other conditions are drawn separately for the second copy,
-    which is not duplicated again. `reorder` is the probability that a packet overtakes: it is sent without delay.
-    Reordering needs a delay above 0.
+    `loss` is the probability, 0 to 1, that a packet is lost, or a model of bursts. Loss is drawn separately for each
+    packet. `duplicate` is the probability that a packet arrives twice. Loss and duplication are drawn together: if a
+    packet is both lost and duplicated, one copy remains. Otherwise loss and the other conditions are drawn separately
+    for the second copy, which is not duplicated again. `reorder` is the probability that a packet is sent without
+    delay, and so overtakes earlier packets. Reordering needs a delay above 0.
 
     `corrupt` is the probability that one bit of a packet flips. The receiver's UDP checksum finds the error, so the
     message is lost. (netem flips bits of the whole Ethernet frame. No checksum of a veth pair covers the 12 bytes of

@@ -229,9 +229,8 @@ class _RandomWords:
         self.next = 0
 
     def take(self, count: int) -> int:
-        """Return the index of the next `count` random numbers in the arrays `loss` and `latency`.
-
-        An array never changes. `refill` creates new arrays.
+        """Return the index of the next `count` random numbers in the arrays `loss` and `latency`. The index stays valid
+        for these arrays, because `refill` creates new arrays and never changes the old ones.
         """
         at = self.next
         if at + count > len(self.loss):

@@ -16,7 +16,7 @@ from sitl._pilot_link import PilotLink
 from sitl.procedure import HEARTBEAT, ProcedureStep
 
 PATIENCE = 10
-"""Number of heartbeats of the vehicle without an answer, after which the pilot gives up a request."""
+"""If the vehicle sends this number of heartbeats but does not answer a request, the pilot gives up the request."""
 MOST_AT_ONCE = 50
 
 _VERSION = ProcedureStep("its version")

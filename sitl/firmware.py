@@ -8,8 +8,8 @@ source tree at the same commit. A tag is not sufficient: `latest` has none, and 
 commit before its tag. A mirror (`base`) replaces both hosts, with the same paths.
 
 This module was written without access to the server, from ArduPilot's build scripts and from published listings. It
-therefore works without the following properties of the server. If the server sends no version mark of a file (ETag or
-Last-Modified), an interrupted download is not resumed. If it does not support ranges, the download restarts. If its
+therefore does not rely on the following properties of the server. If the server sends no version mark of a file (ETag
+or Last-Modified), an interrupted download is not resumed. If it does not support ranges, the download restarts. If its
 listings have an unexpected form, an error message does not list the available versions. The server publishes no
 checksums.
 """

@@ -42,7 +42,7 @@ class Datagram:
 
 @dataclass(frozen=True, slots=True)
 class LoggedEvent:
-    """An event that the agent had to log."""
+    """An event that the agent received for logging."""
 
     agent_id: int
     time_ns: int

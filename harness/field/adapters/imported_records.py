@@ -119,8 +119,8 @@ class ImportRecord(BaseModel):
 AGENTS = "agents"
 FLIGHT_LOGS = "flight-logs"
 INCOMPLETE_LINE = '{"lost_lines":'
-"""The beginning of a trace line that reports lost lines. Written without its end, it marks a trace that ends within a
-line.
+"""The beginning of a trace line that reports lost lines. If a trace ends within a line, the import writes only this
+beginning as the last line, so that the imported trace also ends within a line.
 """
 _COPY_BYTES = 1024 * 1024
 
@@ -206,8 +206,8 @@ def _write(flight: Flight, directory: Path, name: str) -> ImportedFlight:
 
 
 def _survived_trace(trace: Trace, export: Export | None) -> bool:
-    """Return true if the agent was still running after the end of its trace. A later time in the agent's export shows
-    this.
+    """Return true if the agent was still running after the end of its trace. This is so if its export was written later
+    than the last line of its trace.
     """
     if export is None:
         return False
@@ -216,10 +216,10 @@ def _survived_trace(trace: Trace, export: Export | None) -> bool:
 
 
 def _trace_lines(trace: Trace, *, survived_trace: bool) -> Iterator[str]:
-    """Yield the lines of a trace. One line about each gap replaces the lost lines.
+    """Yield the lines of a trace. Each gap becomes one line, which reports the lost lines.
 
-    If a trace ends within a line, its last line stays incomplete, because the agent may have been killed there. If the
-    agent was still running, a line about a gap is written instead.
+    If a trace ends within a line, the agent was probably killed while it wrote this line, so the last yielded line is
+    incomplete, too. If the agent was still running after this line, a line about a gap replaces the incomplete line.
     """
     for entry in trace.entries():
         yield gap_line(entry) if isinstance(entry, TraceGap) else entry.to_line()

@@ -35,10 +35,8 @@ _MAX_TOPICS_LISTED = 5
 
 
 class RosBag(Adapter):
-    """The adapter for ROS bags. `topics` maps each topic name to its content. In a topic name, `{agent}` stands for an
-    agent ID.
-
-    The contents of a topic are `trace`, `sent`, `received`, `event` or `chain`.
+    """The adapter for ROS bags. `topics` maps each topic name to the kind of records on this topic: `trace`, `sent`,
+    `received`, `event` or `chain`. In a topic name, `{agent}` stands for an agent ID.
     """
 
     counts = "message"

@@ -1,9 +1,9 @@
 """Simulate the peers of one agent: `python -m harness.field.bisection._scripted_peers SCRIPT HEARD EPOCH_US SPEEDUP`.
 
 Each line of SCRIPT is a datagram to send, `{"t": mission seconds, "datagram": base64}`, in order of time. An agent
-process is some milliseconds later than in the record, and during a reconcile this delay grows. With fixed sending
-times, datagrams would reach the agent before other timer expiries than in the record. The sending times therefore adapt
-to the agent:
+process reacts some milliseconds later than the recorded agent, and during a reconcile this delay grows. If the peers
+sent at the recorded times, a datagram could arrive before a timer of the agent expires, although it arrived after the
+expiry in the record. The sending times therefore adapt to the agent:
 
 - The line of a response also contains the query (`"after"`, the datagram in base64) and its recorded time
   (`"asked_s"`). The response waits until the agent sends this query, with any sequence number.
@@ -11,7 +11,7 @@ to the agent:
 - During a reconcile, all other datagrams are delayed by the delay of the agent's last query. Lines with `"question"`
   instead of `"datagram"` contain the recorded times of the queries.
 
-HEARD gets a line for each datagram that the agent sends. SIGTERM ends the process.
+The program writes a line to HEARD for each datagram that the agent sends. SIGTERM ends the process.
 """
 
 import asyncio

@@ -61,7 +61,9 @@ class Outcome(_OutcomeModel):
     """The place of the exception that ended the tested code, or None if there was no exception."""
 
     def as_recorded(self) -> "Outcome":
-        """Return the outcome that an agent core without any difference from the records would have."""
+        """Return this outcome without its differences from the records and without a crash. A core that behaves exactly
+        as recorded would have this outcome.
+        """
         agents = {agent: AgentResult(differences=[]) for agent in self.agents}
         return self.model_copy(update={"agents": agents, "crashed": None})
 

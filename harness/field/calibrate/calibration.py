@@ -26,8 +26,8 @@ from netem.channel import PRESETS
 from netem.radio import LogDistance
 
 TRAINING_SHARE = 2 / 3
-"""Share of the flight to which the model is fitted for the validation. The share begins at the start of the flight. The
-fitted model then predicts the rest of the flight.
+"""Share of the flight, from its start on, to which the model is fitted for the validation. The fitted model then
+predicts the rest of the flight.
 """
 BLOCK_S = 120.0
 _BINS = 10
@@ -139,8 +139,10 @@ class CalibrationResult:
             yield self.validation.sentence
 
     def network(self, preset: str | None = None) -> dict[str, object]:
-        """Return the section `network` of a scenario. The section contains a radio, or the shared channel of a preset.
-        A shared channel simulates the losses by other messages, so the section then has only the loss rate `floor`.
+        """Return the section `network` of a scenario. Without a `preset`, the section contains a radio and a loss rate.
+        The loss rate includes the losses by messages of other vehicles. With a `preset`, the section contains a shared
+        channel and the loss rate `floor`, because the channel itself simulates the losses by other messages. If no
+        model was fitted, the section contains only the mean loss rate.
         """
         if self.fit is None:
             delivered = sum(attempt.delivered for attempt in self.attempts)

@@ -98,8 +98,8 @@ class CollectedExports:
     wrong_signatures: list[str] = field(default_factory=list)
     """A sentence about each wrong signature in a secured mission."""
     unproven: str | None = None
-    """The reason why valid signatures do not prove that the exports are genuine. The value is None if valid signatures
-    prove it, or if the mission was not secured.
+    """The reason why the signatures do not prove that the exports are genuine, for example because no public keys are
+    known. The value is None if valid signatures prove it, or if the mission was not secured.
     """
 
     @property
@@ -122,8 +122,9 @@ class CollectedExports:
 
     @property
     def claims(self) -> dict[str, str]:
-        """The wrong hashes that files give for blocks, by the computed hash of the block. A block is not included if
-        another export contains it with the computed hash, or if its agent completed it.
+        """The wrong hashes that files contain for blocks, by the computed hash of the block. A block is omitted if the
+        computed hash is confirmed: if another export contains the block with this hash, or if an agent completed a
+        block with this hash.
         """
         claims = {true: claimed for read_export in self.read_exports for true, claimed in read_export.claims.items()}
         for read_export in self.read_exports if claims else ():

@@ -161,7 +161,8 @@ class Event(RecordLine):
 
 class MissingItem(RecordLine):
     """The line of a missing block of agent `agent_id`. If `block` is null, the vehicle itself is missing. `agents`
-    lists the missing vehicles that may have the block. If no other vehicle is missing, it contains only `agent_id`.
+    lists the missing vehicles that may have the block. If no other vehicle is missing, the list contains only
+    `agent_id`.
     """
 
     line: Literal["lost"] = "lost"
@@ -183,8 +184,7 @@ class Vehicle(RecordLine):
 
 class ReconcileResult(RecordLine):
     """The last line of the record: the result of a final reconcile of the exports. `chain` contains the hashes of the
-    uniform chain, oldest first. It is empty if the chains are not uniform.
-
+    chain that all agents share, oldest first. If the agents do not all have the same chain, `chain` is empty.
     `left_out` lists the blocks that are in no chain, with the reasons.
     """
 

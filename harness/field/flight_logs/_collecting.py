@@ -30,8 +30,8 @@ Kind = TypeVar("Kind", bound=FlightRecord)
 
 
 class LogClock:
-    """The clock of a flight log. The object rejects a single record with a wrong time. If several records have new
-    times that are consistent with each other, the clock has jumped.
+    """The clock of a flight log. If a single record has a wrong time, the object rejects the record. If several records
+    have new times that are consistent with each other, the object assumes that the clock has jumped.
     """
 
     def __init__(self) -> None:

@@ -85,8 +85,8 @@ class MatchedLog:
 
 def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[MatchedLog]:
     """Find the agent of each vehicle in the flight logs. `agents` contains the logged positions of each agent. If
-    several flights along the same path match an agent, the agent gets the flight that is nearest in time by its own
-    clock.
+    several flights follow the path of one agent, the function chooses the flight whose time differs least from the
+    agent's own clock.
     """
     matches = [_match(log, vehicle, agents) for log in logs for vehicle in log.vehicles]
     nearest: dict[int, float] = {}
@@ -97,7 +97,9 @@ def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[M
 
 
 def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
-    """Return the match. If a different log fits the agent's clock better, return the match without its agent."""
+    """Return the match. If another log with the same path is nearer to the agent's clock, this log is from another
+    flight. The returned match then has no agent.
+    """
     if match.agent_id is None or match.clock_ahead_s is None:
         return match
     later_s = nearest[match.agent_id] - match.clock_ahead_s
@@ -128,9 +130,9 @@ def _match(log: FlightLog, vehicle: VehicleLog, agents: Mapping[int, Fixes]) -> 
 
 @dataclass(frozen=True)
 class _ClockDifference:
-    """The difference between the clock of an agent and the clock of a flight log. If `of_utc` is true, UTC from GPS
-    takes the place of the log's clock. `voters` is the number of positions that were compared, and `agreeing` is the
-    number of those that support this difference.
+    """The time on the clock of an agent minus the time on the clock of a flight log. If `of_utc` is true, it is the
+    time on the agent's clock minus UTC, because the log has GPS time. `voters` is the number of positions that were
+    compared, and `agreeing` is the number of those that support this difference.
     """
 
     ahead_us: float

@@ -86,7 +86,8 @@ class GpsTime(NamedTuple):
 
     at_us: int
     utc_us: int
-    """UTC according to this record alone. All other records get `utc_us` from the median of many records of this type.
+    """UTC according to this record alone. In all other records, `utc_us` is computed from the median of many GPS
+    times.
     """
     week: int
     week_ms: int

@@ -86,9 +86,8 @@ def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | No
 def assign_keys(
     flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[UnusedPart]
 ) -> None:
-    """Assign public keys to each flight. A flight gets the keys that verify a signature in its exports.
-
-    If any block is signed, unused keys belong to another mission and are omitted.
+    """Assign public keys to each flight: the keys with which a signature in the exports of this flight is valid. If any
+    flight has signed blocks, keys without a valid signature belong to another mission and are omitted.
     """
     signed = {id(flight): [*_signed(flight)] for flight in flights} if found else {}
     unused = dict(found)
@@ -114,7 +113,9 @@ def read_mission_file(path: Path, left_out: list[UnusedPart]) -> Mission | None:
 def assign_mission_files(
     flights: Sequence[Flight], found: Sequence[tuple[Path, Mission]], left_out: list[UnusedPart]
 ) -> None:
-    """Assign each mission file to the flights of its mission. A flight without traces gets its roster."""
+    """Assign each mission file to the flights of its mission. If a flight has no roster, because it has no traces, it
+    takes the roster from the mission file.
+    """
     for path, mission in found:
         of_mission = [flight for flight in flights if flight.initial_data == mission.initial_data]
         for flight in of_mission:

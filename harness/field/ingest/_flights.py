@@ -217,8 +217,8 @@ def _hashes_of(incarnation: TraceIncarnation) -> set[str]:
 def _add_without_header(
     groups: list[_FlightRecords], incarnation: TraceIncarnation, left_out: list[UnusedPart], remarks: list[FileRemark]
 ) -> None:
-    """Add a trace without a header to the flight with which it has the most hashes in common. The trace gets a header
-    of this flight.
+    """Add a trace without a header to the flight with which it has the most hashes in common. The header of another
+    trace of this flight replaces the lost header.
     """
     agent_id, hashes = incarnation.agent_id, _hashes_of(incarnation)
     if agent_id is None or not incarnation.runs:

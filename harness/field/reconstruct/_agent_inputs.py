@@ -1,10 +1,10 @@
 """Divide a trace into the inputs of the agent, and guess the inputs whose trace lines are lost.
 
-Each input has the handler runs that it caused. `bridge` guesses lost inputs: they lead the agent to its next known
-state. The lost inputs are unknown. The state after them is known: a chain, and the events in the current block. The
-module simulates peers that already hold this chain. They answer each query of the agent, approve its blocks in the
-order of the chain, and send it the blocks that it lacks. The events come from the agent's own later blocks. The agent
-itself is a real agent core, so a scenario can play the same inputs.
+Each input is stored together with the handler runs that it caused. `bridge` guesses lost inputs. The lost inputs
+themselves are unknown, but the state of the agent after them is known: its chain, and the events in its current block.
+The module therefore simulates peers that already hold this chain. The peers answer each query of the agent, approve its
+blocks in the order of the chain, and send it the blocks that it lacks. The events come from the agent's own later
+blocks. The agent itself is a real agent core, so a scenario can play the same inputs.
 """
 
 import base64

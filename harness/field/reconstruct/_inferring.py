@@ -197,8 +197,8 @@ def _infer_incarnation(
 
 
 def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
-    """Choose the next order of inputs to try. The function changes the position of the last timer that has another
-    possible position. Return false if no timer has one.
+    """Choose the next order of inputs to try: change the position of one timer, and reset the positions of all later
+    timers. The function chooses the last timer that has a further possible position. Return false if no timer has one.
     """
     for place in range(len(choices) - 1, -1, -1):
         if deferred.get(place, 0) < choices[place]:
@@ -210,10 +210,9 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent between two restarts.
-
-    At first, each timer expires at its most likely position among the other inputs. `deferred` maps the number of a
-    timer to the number of inputs by which its expiry is moved from there.
+    """One possible order of the inputs of an agent between two restarts. At first, each timer expires at its most
+    likely position among the other inputs. `deferred` maps the number of a timer to the number of inputs by which its
+    expiry is moved from this most likely position.
     """
 
     def __init__(
@@ -229,7 +228,9 @@ class _InputSequence:
         self.inputs: list[RecordedInput] = []
         self.problem: str | None = None
         self.choices: list[int] = []
-        """Number of a timer -> number of other possible positions of its expiry among the inputs."""
+        """Number of a timer -> number of further positions among the inputs at which the expiry of this timer is
+        possible.
+        """
         self._header = header
         self._agent = _agent(header)
         self.pause: Pause | None = None
@@ -295,8 +296,8 @@ class _InputSequence:
         return None if deadline is None else self._end_of_pause(deadline, JUST_AFTER_S)
 
     def _begin_requested_reconcile(self, next_s: float) -> bool:
-        """Begin a reconcile if the capture shows a reconcile before the next input that no other input caused. The
-        operator must have requested this reconcile. Return true if a requested reconcile begins.
+        """Begin a reconcile if the capture shows that a reconcile began before the next input. Because no input caused
+        this reconcile, the operator must have requested it. Return true if a requested reconcile begins.
         """
         if self._explained == len(self._sent) or self._agent.state.reconcile_in_progress:
             return False

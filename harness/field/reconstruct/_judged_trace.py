@@ -59,8 +59,8 @@ class JudgedTrace:
     def with_known_states(
         self, incarnations: Sequence[Sequence[RecordedInput]]
     ) -> list[list[RecordedInput | KnownState]]:
-        """Return the inputs that can be simulated. If inputs are lost, the result contains the known state after them
-        in their place.
+        """Return the inputs that can be simulated. Where inputs are lost, the result contains the known state of the
+        agent after the lost inputs.
         """
         parts = [[*self._parts(inputs)] for inputs in incarnations]
         for before, after in zip(parts, incarnations[1:], strict=False):
@@ -92,7 +92,9 @@ class JudgedTrace:
 
 
 def _disk(boot: RecordedInput) -> KnownState | None:
-    """Return the recorded content of the disk at a restart. Return None if some of its blocks were not in the chain."""
+    """Return the recorded content of the disk at a restart. Return None if the disk contained blocks that were not in
+    the chain.
+    """
     run = boot.runs[0]
     try:
         blocks = [*stored_blocks(run.input)]

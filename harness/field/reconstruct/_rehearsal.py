@@ -1,11 +1,11 @@
 """Simulate one agent alone with its recorded inputs, to find the part of its record that follows the protocol.
 
-The agent core, with or without a known mistake (quirk), gets each recorded input at its recorded time. The resulting
-handler runs must equal the recorded ones. The reference implementation is not used for this, because the scenario will
-be played by agents, and quirks exist only for the agent core. The reference only names the deviations from the
-protocol: `_comparing` gets them from the step judge. The first deviation of an agent is therefore known before the
-whole flight is simulated. The simulation also determines which datagrams had an effect, which timers were started, and
-which datagrams were sent.
+The agent core, with or without a known mistake (quirk), receives each recorded input at its recorded time. The
+resulting handler runs must equal the recorded ones. Because of this comparison, the first deviation of an agent is
+known before the whole flight is simulated. The reference implementation is not used here, because the scenario will be
+played by agents, and quirks exist only for the agent core. The reference is used only to name the deviations from the
+protocol: `_comparing` reads these names from the step judge. The simulation also determines which datagrams had an
+effect, which timers were started, and which datagrams were sent.
 """
 
 import base64
@@ -103,8 +103,8 @@ class SoloSimulation:
     inferred: int = 0
     """Number of guessed inputs that replace lost lines."""
     stopped: str | None = None
-    """The reason why lines were lost, if the simulation could not reach the state after these lines. The simulation
-    ends at this place.
+    """The reason why trace lines were lost. It is set only if the simulation could not reach the known state after
+    these lines, and so ended before them.
     """
 
 
@@ -117,7 +117,9 @@ class ToleratedDeviations:
 
 
 Incarnations = Sequence[Sequence[RecordedInput | KnownState]]
-"""The inputs of each incarnation. If inputs are lost, the known state after them takes their place."""
+"""The inputs of each incarnation. Where inputs are lost, the list contains the known state of the agent after the lost
+inputs.
+"""
 
 
 def rehearse(

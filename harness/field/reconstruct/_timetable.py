@@ -1,12 +1,12 @@
 """Put the inputs of all agents on one common time axis.
 
 The common times follow three rules. The inputs of each agent keep their order. A message arrives after it was sent. A
-timer does not expire before its duration is over. Each input gets the earliest time that these rules allow, but not
-before its recorded time on the agent's clock. The simulated chains therefore equal the recorded ones, even if a clock
-was changed or is known only roughly. Only intervals of time become longer.
+timer does not expire before its duration is over. Each input is planned at the earliest time that these rules allow,
+but not before its recorded time on the agent's clock. The simulated chains therefore equal the recorded ones, even if a
+clock was changed or is known only roughly. The times between inputs may become longer than in the record.
 
-A *stray* is a received datagram that no simulated agent sent. The scenario sends it as a separate datagram. If a
-datagram was received before it was sent, according to the records, it also becomes a stray.
+A *stray* is a received datagram that no simulated agent sent. The scenario sends a stray as a separate datagram. A
+datagram that was received before it was sent, according to the records, also becomes a stray.
 """
 
 import math
@@ -218,8 +218,8 @@ class _TimetablePlanner:
         return self._table.clocks[agent].at(self._played[agent][place].input.at_s)
 
     def _sent(self, agent: int, place: int) -> tuple[int, int] | None:
-        """Return the sender and the number of the datagram that this input receives. Return None if the input is no
-        datagram, or if no simulated agent sent the datagram.
+        """Return the sender and the number of the datagram that is received in this input. Return None if the input is
+        no datagram, or if no simulated agent sent the datagram.
         """
         cause = self._played[agent][place].input.cause
         if not isinstance(cause, DatagramReceived) or (agent, place) in self._as_strays:

@@ -105,8 +105,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """The reasons why lost lines may explain deviations, such as "lines are missing ...". The key is the position
-        of the entry with the deviations.
+        """Position of an entry whose deviation lost lines may explain -> a description of the lost lines, such as
+        "lines are missing ...".
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]
@@ -185,9 +185,9 @@ class RecordedTrace:
         return any(run.state.reconciling for run in islice(runs, 1))
 
     def beginnings(self, number: int) -> Iterator[str]:
-        """Yield each part of line `number` of the trace file that ends at the beginning of a disk block.
-
-        A file system stores a file in blocks, and a damaged disk loses whole blocks.
+        """Yield the possible truncated forms of line `number` of the trace file. A file system stores a file in blocks,
+        and a damaged disk loses whole blocks. Each yielded text therefore begins at the start of the line and ends
+        where a disk block begins.
         """
         begin, line = 0, b""
         with suppress(OSError), open_plain_file(self.path) as file:
@@ -243,10 +243,9 @@ class RecordedTrace:
 
     def ends_open(self, follower: StepComparer) -> str | None:
         """Return a sentence if the record ends early: the agent left no export, and other agents continued after its
+        last line. If no agent left an export, the agents may have been stopped at different times. In this case, the
+        record ends early only if a timer of the agent was due. `follower` contains the state of the agent after the
         last line.
-
-        If no agent left an export, the agents may have been stopped at different times. Only a due timer then proves an
-        early end. `follower` has the state after the last line.
         """
         trace, flight = self.trace, self.flight
         if trace.cut_off or trace.problem or self.agent_id in flight.exports:
@@ -271,8 +270,9 @@ class RecordedTrace:
     def was_paused(self, since: float, until: float) -> bool:
         """Return true if the agent was paused, or may have been paused, between two mission seconds.
 
-        If there is a run.json, it contains the pauses. Otherwise, a long time without lines suggests a pause. Outside
-        of this time, only little time may have passed, because a running agent handles an overdue timer soon.
+        If there is a run.json, it contains the pauses. Otherwise, a long time without lines suggests a pause. This time
+        must nearly fill the interval between the two mission seconds, because a running agent handles an overdue timer
+        soon.
         """
         if self.flight.record is not None:
             return Evidence({}, record=self.flight.record).was_paused(self.agent_id, since, until)

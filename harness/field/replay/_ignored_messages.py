@@ -77,8 +77,9 @@ def _without_line(record: RecordedTrace) -> Iterator[tuple[int, CapturedDatagram
     position of the trace entry that follows the arrival. Messages before the first entry or after the last entry of an
     incarnation are skipped.
 
-    The messages in both trace and capture show the difference between the clocks of the two files. A message during
-    which one clock was set is skipped, because its position in the trace is not known.
+    The messages that both files contain show the difference between the clock of the trace and the clock of the
+    capture. If this difference changes around a message, one clock was set. This message is skipped, because its
+    position in the trace is not known.
     """
     arrivals = record.arrivals or []
     times = [entry.content.t for entry in record.entries]

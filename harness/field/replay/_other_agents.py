@@ -107,9 +107,9 @@ class _OtherAgent:
         )
 
     def related_lines(self, their_run: int, run: HandlerRun) -> Iterator[Text]:
-        """Yield text about the lines of the other agent that are related to the current step. These are the line that
-        sent the message of the current step, and the lines that received messages from the current step. A message
-        without a receipt in the trace has a text, too.
+        """Yield text about the lines of the other agent that are related to the current step: the line that sent the
+        message of the current step, and the lines that received messages from the current step. If the trace of the
+        other agent does not contain the reception of a message, a text states this.
         """
         trigger = run.trigger
         if isinstance(trigger, MessageTrigger) and trigger.sender == their_run:

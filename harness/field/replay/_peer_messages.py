@@ -88,8 +88,8 @@ class PeerMessages:
 
 
 def _is_same(sender: HandlerRun, receiver: HandlerRun) -> bool:
-    """Return false if the received datagram is none of those that the sender sent. A restarted agent uses sequence
-    numbers again, so type and sequence number alone do not identify a message.
+    """Return false if the received datagram differs from all datagrams that this handler run of the sender sent. A
+    restarted agent uses sequence numbers again, so type and sequence number alone do not identify a message.
     """
     datagrams = [message.datagram for message in sender.sent]
     return receiver.input is None or None in datagrams or receiver.input in datagrams

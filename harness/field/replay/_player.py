@@ -202,7 +202,7 @@ class RecordPlayer:
         return result
 
     def _judge_end(self, result: ReplayResult) -> None:
-        """Add the reason why the record ends if the agent did not end regularly."""
+        """If the agent did not end regularly, add the reason to the result."""
         record = self.record
         if record.flight.record is not None:
             recorded = record.flight.record.agents.get(str(record.agent_id))

@@ -159,8 +159,9 @@ def _is_hex(text: str) -> bool:
 WITHIN = 200
 """Number of trace lines before an entry, and after it, in which the detector searches for a change of the clock."""
 MESSAGES = 3
-"""Number of messages before a possible change of the clock, and after it, whose median time differences are compared.
-If no such groups differ, the detector also tries smaller groups at the first and the last messages.
+"""Number of messages in a group. To find a change of the clock, the detector compares the median time difference of a
+group of messages with that of the following group. If no such groups differ, the detector also tries smaller groups at
+the first and the last messages.
 """
 MIN_SHIFT_S = 1.0
 """Minimum change of a clock, in seconds, that the detector reports."""
@@ -196,8 +197,8 @@ class ClockChangeDetector:
 
     @cached_property
     def _differences(self) -> list[list[tuple[int, float]]]:
-        """Lists of the messages between each other agent and this agent. Each message is a pair: its position in the
-        trace, and the difference of both clocks in seconds.
+        """One list for each other agent, with the messages between the other agent and this agent. Each message is a
+        pair: its position in the trace, and the difference of both clocks in seconds.
         """
         own = self._record.agent_id
         differences = []

@@ -21,7 +21,9 @@ from harness.field.replay._record_search import IngestedRecords
 
 
 def field_evidence(evidence: Evidence, flight: Flight) -> Evidence:
-    """Return the evidence with its traces replaced by the traces of a flight, and with the judgement on their steps."""
+    """Return the evidence with the traces of this flight. The returned evidence also contains the judgement on the
+    steps in these traces.
+    """
     results: dict[int, ReplayResult | str] = {}
     traces: dict[int, Trace] = {}
     for agent_id, recorded in flight.traces.items():

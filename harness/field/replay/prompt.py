@@ -163,7 +163,7 @@ class ReplayPrompt(cmd.Cmd):
             self._print_message(f"no breakpoint at {arg[:60]!r}")
 
     def do_debug(self, arg: str) -> None:
-        """debug (d): play this step again in the debugger, pdb or that of the IDE; `step` then enters its handler"""
+        """debug (d): play this step again in the debugger (pdb or that of your IDE); `step` enters the handler"""
         player = self._player
         if not player.position:
             raise FieldError("no step is played yet: enter next, then debug")

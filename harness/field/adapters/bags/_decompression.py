@@ -42,9 +42,9 @@ Item = RawMessage | UnreadablePart
 
 
 class BagTopics:
-    """An index of the topics in a ROS bag, by channel. If the topic of a message is not known yet, the message is
-    stored until the end of the file, because an index at the end may declare the topic. Messages of one channel keep
-    their order.
+    """The topic of each channel in a ROS bag. If the topic of a channel is not known yet, the object stores the
+    messages of this channel until the end of the file, because the end of the file may declare the topic. Messages of
+    one channel keep their order.
     """
 
     def __init__(self) -> None:

@@ -21,8 +21,8 @@ MAX_GAP_PX = 0.6
 """Width in pixels below which a gap between two blocks is invisible. Blocks with a narrower gap are drawn as one box.
 """
 OUTLIER_SHARE = 0.01
-"""Share of the earliest and of the latest events that do not determine the time span, because their clocks may be
-wrong.
+"""Share of the events, at the beginning and again at the end, that the time span ignores, because the clocks of these
+events may be wrong.
 """
 SHADES = 4
 MAX_NAMED = 8
