@@ -150,7 +150,9 @@ class _PlayRequest:
     limit_s: float
 
     def workshops(self, directory: Path) -> list[SubjectPlayer]:
-        """Return a player for each agent command. It plays the scenario or the record. Raises HarnessError."""
+        """Return one player for each agent command. Each player plays the scenario or the record. Raises
+        HarnessError.
+        """
         subject = subject_of(self.subject, self.seed, self.agent)
         workshops = []
         for number, command in enumerate(self.commands):

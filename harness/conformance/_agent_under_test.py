@@ -75,7 +75,7 @@ def mission(
     speedup: float,
     keys: Mapping[str, Any] = NO_KEYS,
 ) -> dict[str, Any]:
-    """Return a mission file for the agent. The keys in `keys` replace or extend those of the file."""
+    """Return a mission file for the agent. `keys` contains additional keys of the file, and keys with other values."""
     return {
         "schema": SCHEMA,
         "contract": CONTRACT,

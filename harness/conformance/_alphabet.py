@@ -47,16 +47,16 @@ class AgentInput:
     name: str
     make: Callable[[ReferenceModel], Action | None]
     tally: Tally | None = None
-    """The activity in which the agent's counted answers change the effect of the input. "timer" stands for the activity
-    that ends with the running timer. None if counted answers never change the effect.
+    """The activity whose counted answers decide the effect of the input. "timer" means the activity that ends with the
+    running timer. None if counted answers never change the effect of the input.
     """
     counted_twin: str | None = None
-    """Name of a similar answer that the agent must count. Only for answers that the agent must ignore, and for nothing
-    else.
+    """Name of a similar answer that the agent must count. Only inputs that are answers which the agent must ignore have
+    a twin. None for all other inputs.
     """
     preceding: str | None = None
-    """Name of an answer that arrives before a timer expiry, and that the agent must ignore. The expiry shows whether
-    the agent counted it. Only for inputs that are timer expiries.
+    """Name of an answer that the agent must ignore. The test sends this answer directly before the timer expiry,
+    because the expiry shows whether the agent counted the answer. None if the input is no timer expiry.
     """
 
 

@@ -111,8 +111,8 @@ class BlameEvidence:
         return (failure.variant, VectorKey(*failure.observation.before, TIMER)) not in self._pairs
 
     def _counts_wrongly_from_start(self, failure: ConfirmedFailure) -> bool:
-        """Return true if the agent probably began to count answers with a wrong number, because it decides correctly
-        after other counts.
+        """Return true if the agent probably set its counters to a wrong initial value. This is likely if the agent
+        decides wrongly only with few counted answers, or only after an earlier vote or reconcile.
         """
         observation, first = failure.observation, failure.observation.outcome.runs[0]
         if first.handler not in BEGINNING_OF_COUNT:

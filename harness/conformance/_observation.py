@@ -104,7 +104,7 @@ class TestedStep:
     wrong_status_keys: tuple[str, ...] = ()
     """Keys of the status with wrong values."""
     wrong_timer: str | None = None
-    """Name of the timer that expired or will expire at a wrong time. None if no timer does."""
+    """Name of a timer that expired or will expire at a wrong time. None if there is no such timer."""
     running_timer: str | None = None
     """Name of the next timer to expire, if its expiry time is correct. None over UDP."""
     ended: str | None = None

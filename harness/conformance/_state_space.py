@@ -35,9 +35,8 @@ class SettingsVariant:
 
 
 def _settings(**other: object) -> Settings:
-    """Return settings in which each timer has a different duration and each event completes a block.
-
-    In the default settings, a vote ends before any phase that begins after it.
+    """Return settings in which each timer has a different duration and each event completes a block. As with the
+    default settings, a vote ends before any reconcile phase that begins after the vote.
     """
     timers = {"vote_timeout_s": 10.0, "phase1_timeout_s": 12.0, "phase2_timeout_s": 13.0, "phase3_timeout_s": 14.0}
     room = {"max_block_bytes": MAX_EVENT_DATA_BYTES, "max_event_bytes": MAX_EVENT_DATA_BYTES}
@@ -260,8 +259,8 @@ COUNTING_STATES = {
     ("phase two", (2, "another's block", "", 0)),
 }
 """Pairs of activity and holdings. In states with such a pair, the exploration tries more than one answer, and tests
-answers that the agent must ignore. An agent counts and decides in the same way in all other states. The listed states
-have a long chain and an empty stack, so one agent can reach them repeatedly.
+answers that the agent must ignore. It tests this only here, because an agent counts and decides in the same way in all
+other states. These states have a long chain and an empty stack, so that one agent can reach them repeatedly.
 """
 
 

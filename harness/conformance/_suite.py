@@ -33,8 +33,8 @@ from harness.errors import UnsupportedError
 MAX_WORKERS = 24
 """Maximum number of agents in parallel."""
 WORKERS_PER_PASS = 0.01
-"""Increase of the maximum number of parallel agents for each passed test, after a slow machine has forced the suite to
-reduce this maximum.
+"""Each passed test increases the maximum number of parallel agents by this number. This applies after a slow machine
+has forced the suite to reduce the maximum.
 """
 MIN_WORKERS = 6
 """Minimum number of agents in parallel on a machine that is often late."""

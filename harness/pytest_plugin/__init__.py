@@ -108,7 +108,9 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 @pytest.fixture
 def swarm(request: pytest.FixtureRequest) -> Iterator[Swarm]:
-    """Provide a swarm that the test controls. It has five agents and no loss, unless a marker changes that."""
+    """Provide a swarm that the test controls. By default, it has five agents and no loss. Markers change these
+    values.
+    """
     from harness.pytest_plugin._fixtures import swarm_for
 
     yield from swarm_for(request.node)
@@ -124,8 +126,8 @@ def scenario(request: pytest.FixtureRequest) -> Iterator[Findings]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None]:
-    """Judge the run as a part of its test, so that a violation makes the test fail. After the test it would be too
-    late.
+    """Judge the run as a part of its test, because a violation after the end of the test could not make the test
+    fail.
     """
     try:
         yield

@@ -22,8 +22,8 @@ from harness.scenario.expect import Expect
 
 
 class RunOfOneTest:
-    """The run of one test. The function `finish` ends the run and judges it. If its argument is true, it first waits
-    until the agents are idle.
+    """The run of one test. The function `finish` ends the run and judges it. `finish(True)` first waits until the
+    agents are idle.
 
     `variant` is the file of the protocol variant of the run. It is None if the run uses the original protocol.
     """

@@ -16,10 +16,11 @@ from netem.errors import UmlError
 
 
 def session_inside(config: pytest.Config) -> int | None:
-    """Run all tests in User Mode Linux with the same command line, and return the exit status.
+    """Run all tests in User Mode Linux with the same command line, and return the exit status. The files of failed
+    tests remain after the guest has ended.
 
-    Return None if the session already runs inside, or if User Mode Linux is missing. If it is missing, `refuse_outside`
-    skips the tests that need User Mode Linux. The files of failed tests remain after the guest has ended.
+    Return None in two cases: the session already runs in User Mode Linux, or User Mode Linux is missing. In the second
+    case, `refuse_outside` skips the tests that need it.
     """
     if uml.inside() or _missing() is not None:
         return None

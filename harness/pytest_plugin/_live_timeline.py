@@ -186,11 +186,11 @@ class LiveTimeline(GrowingTimeline):
         await self.until(swarm, mission_s)
 
     async def until_idle(self, swarm: mission.Swarm, limit_s: float) -> RunOutcome | None:
-        """Continue until all agents have voted since the last action and are idle. Return None if this does not happen
-        by `limit_s`.
+        """Continue until all agents have voted since the last action and are idle. Return the state of the run. Return
+        None if the agents are not idle by `limit_s`.
 
-        The snapshot is taken while no chain changes, because real processes continue to run. The method waits for votes
-        because an agent detects only by a vote that its chain differs from other chains (Section 3.2).
+        The method reads the state at a time when no chain changes, because real processes continue to run. The method
+        waits for votes, because an agent detects only by a vote that its chain differs from other chains (Section 3.2).
         """
         end_s = swarm.now() + limit_s
         while any(
@@ -234,10 +234,8 @@ class LiveTimeline(GrowingTimeline):
         await mission.settle(swarm, self.scenario)
 
     async def break_off(self, swarm: mission.Swarm) -> None:
-        """End the mission now, because the test failed. The recorded scenario also ends here.
-
-        A scenario lasts at least as long as its timeline. If a change of the timeline ends later, the recorded duration
-        does not change.
+        """End the mission now, because the test failed. The recorded scenario also ends now, unless a change in its
+        timeline lasts longer or it has a schedule. In these cases, its duration stays the same.
         """
         await self.release(swarm)
         lasts_s = max([0.0, *(entry.ends_at_s for entry in self.scenario.timeline)])

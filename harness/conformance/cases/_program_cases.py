@@ -40,8 +40,8 @@ INPUTS = 50
 SIGNAL_GAP_S = 0.05
 """Seconds of wall time between two signals. The kernel discards a signal if an equal signal is still pending."""
 SECONDS_WITHOUT_EVENT = 20.0
-"""Duration in mission seconds of a test in which the agent must log no event. An agent that draws an event each second
-would log at least one event in this time with a probability of almost 1.
+"""Duration in mission seconds of a test in which the agent must log no event. A wrong agent that logs random events,
+one each second on average, almost certainly logs at least one event in this time.
 """
 
 

@@ -88,7 +88,9 @@ class ShrunkScenario:
     seed: int
     violated: dict[str, Judgement]
     words: str
-    """A text that compares the size of the scenario before and after the reduction, with the number of runs."""
+    """A text that compares the size of the scenario before and after the reduction. The text also contains the number
+    of runs that the reduction needed.
+    """
     replay: str
 
 
@@ -117,7 +119,7 @@ class SearchProgress:
 
     on_violation: Callable[[ViolatingRun], None] = field(default=lambda violation: None)
     on_step: Callable[[int, str], None] = field(default=lambda runs, words: None)
-    """A function that gets the number of runs so far, and a text with the size of the current scenario."""
+    """A function that receives the number of runs so far, and a text with the size of the current scenario."""
     shown: bool = False
 
 

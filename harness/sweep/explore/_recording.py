@@ -36,7 +36,7 @@ class RecordedEvent:
 
 @dataclass(frozen=True, slots=True)
 class LostMessage:
-    """A message that one receiver did not get."""
+    """A message that one receiver did not receive."""
 
     at_s: float
     """The mission second at which the message was sent."""
@@ -104,8 +104,8 @@ class _EventRecorder(MemoryRecorder):
 
 
 class _RecordingScript(FateScript):
-    """A script that decides which messages are lost or delayed. The object also records each message that is lost,
-    either because of the script or by chance.
+    """A script that decides which messages are lost or delayed. The object also records each message that is lost
+    because of the script or by chance.
     """
 
     def __init__(self, fates: Sequence[Fate], roster: Sequence[int], name_of: NameOf, *, tape: _EventRecorder) -> None:

@@ -128,8 +128,8 @@ def _silent(layer: Document) -> Document:
 
 
 def _silent_change(change: Document) -> Document:
-    """Return a change of the network with its message losses set to zero. The change is a timeline entry or the
-    repeated part of a schedule.
+    """Return a copy of a network change, with all message losses in the change set to zero. The change is a timeline
+    entry or the repeated part of a schedule.
     """
     silent = {**change, **_silent(change)}
     return {**silent, "network": _without_loss(change["network"])} if "network" in change else silent
@@ -181,7 +181,9 @@ def _network(network: Document, kept: Collection[int]) -> Document:
 
 
 def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
-    """Return a schedule without agents that are not kept. Return None if the schedule then has no effect."""
+    """Remove from a schedule all agents that are not kept, and return the result. Return None if the schedule then has
+    no effect.
+    """
     if "repeat" in schedule:
         repeat = _keep_network_change(schedule["repeat"], kept)
         return {**schedule, "repeat": repeat} if repeat else None
@@ -193,7 +195,9 @@ def _schedule(schedule: Document, kept: Collection[int]) -> Document | None:
 
 
 def _keep_network_change(change: Document, kept: Collection[int]) -> Document:
-    """Return a network change of a timeline entry or a schedule without agents that are not kept."""
+    """Remove from a network change all agents that are not kept, and return the result. The network change belongs to a
+    timeline entry or a schedule.
+    """
     groups = [[agent for agent in group if agent in kept] for group in change.get("partition", [])]
     change = with_key(change, "partition", [group for group in groups if group])
     return with_key(change, "network", _network(change.get("network", {}), kept))
@@ -205,7 +209,9 @@ def _agents_in(fate: Document) -> set[int]:
 
 
 def _entry(entry: Document, kept: Collection[int]) -> Document | None:
-    """Return a timeline entry without agents that are not kept. Return None if the entry then has no effect."""
+    """Remove from a timeline entry all agents that are not kept, and return the result. Return None if the entry then
+    has no effect.
+    """
     if "partition" in entry or "network" in entry:
         entry = _keep_network_change(entry, kept)
         return entry if "partition" in entry or "network" in entry else None

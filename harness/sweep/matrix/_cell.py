@@ -37,8 +37,8 @@ class Run(CellRecord):
     figures: dict[str, float | int | None] = {}
     verdicts: dict[str, Verdict] = {}
     deviates_in: str | None = None
-    """The handler of the first step that deviates from the algorithms. If an edit broke code that the judge shares with
-    the agents, the edited files instead. None if no step deviates.
+    """The handler of the first step that deviates from the algorithms. None if no step deviates. If an edit broke code
+    that the judge shares with the agents, the value contains the names of the edited files instead.
     """
     steps: str = ""
     """The fingerprint of the run's handler runs (see `_run_steps`). It is empty for real processes, and for runs
@@ -47,8 +47,8 @@ class Run(CellRecord):
     failed: str | None = None
     unsupported: str | None = None
     reached: Annotated[Any, Field(exclude=True)] = None
-    """If the coverage of this run was measured, a `harness.proof.coverage.ReachedStates`. This field is not written to
-    files.
+    """The states that this run reached (`harness.proof.coverage.ReachedStates`). None if the coverage was not measured.
+    This field is not written to files.
     """
 
     @property
@@ -61,12 +61,13 @@ class Run(CellRecord):
 
 
 class Cell(CellRecord):
-    """The summary of all runs with one combination of values.
+    """The summary of all runs with one combination of values. `failed` and `unsupported` are numbers of runs without
+    numeric results.
 
-    `failed` and `unsupported` are numbers of runs without numeric results. `estimates` contains an estimate for each
-    metric. `verdicts` contains the number of runs with each verdict, for each check. `violated` contains the seeds of
-    runs with a bad verdict, for each check. `unfinished` contains the seeds of runs in which the swarm only needed more
-    time. In some runs, a step deviates from the algorithms. `deviations` counts these runs by `Run.deviates_in`.
+    `estimates` contains an estimate for each metric. `verdicts` contains the number of runs with each verdict, for each
+    check. `violated` contains the seeds of runs with a bad verdict, for each check. `unfinished` contains the seeds of
+    runs in which the swarm only needed more time. `deviations` maps each value of `Run.deviates_in`, such as a handler
+    that deviates from the algorithms, to the number of runs with this value.
     """
 
     runs: int

@@ -148,8 +148,8 @@ def growths(matrix: Matrix, cells: Sequence[Cell], runs: Sequence[Run]) -> list[
     """Fit laws of growth for each backend and loss rate.
 
     Laws over agents are fitted for one mission length, and laws over blocks for one number of agents. Laws over both
-    use all sizes. If the load is below 1 in only some cells, laws over agents are also fitted separately to the cells
-    with a load below 1 and to the others.
+    use all sizes. If some cells have a load below 1 and others do not, laws over agents are also fitted separately to
+    these two groups of cells.
     """
     load_of = {cell.point: "from 1" if overloaded(cell) else "below 1" for cell in cells}
     found: list[Growth] = []

@@ -25,7 +25,9 @@ from harness.sweep.matrix.matrix_record import MatrixRecord
 COLUMNS = 3
 HEAD, PANEL_HEIGHT, FOOT = 96, 236, 26
 MAX_LINES = 4
-"""Maximum number of lines in a chart. Of more lines, the chart shows a selection with even distances."""
+"""Maximum number of lines in a chart. If there are more lines, the chart shows a selection of them at even
+distances.
+"""
 TICK_WIDTH = 24.0
 
 

@@ -69,12 +69,12 @@ class Matrix(StrictModel):
     """
     loss: Annotated[list[Probability], Field(min_length=1, max_length=100)]
     seeds: int | list[int] = 200
-    """Number of seeds, which are then 1, 2 and so on, or a list of seeds."""
+    """Either a list of seeds, or the number of seeds. With a number, the seeds are 1, 2 and so on."""
     agents: (
         Annotated[list[Annotated[int, Field(ge=1, le=MAX_AGENTS, strict=True)]], Field(min_length=1, max_length=100)]
         | None
     ) = None
-    """Numbers of agents. By default, the number of the scenario."""
+    """Numbers of agents. By default, the number of agents in the scenario."""
     duration_s: (
         Annotated[list[Annotated[Seconds, Field(le=MAX_DURATION_S)]], Field(min_length=1, max_length=100)] | None
     ) = None

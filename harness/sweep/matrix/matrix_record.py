@@ -44,7 +44,7 @@ class MatrixCoverage(BaseModel):
 
 
 class CoverageTally:
-    """The agent states that the runs of a matrix have reached, of all runs together and of each cell."""
+    """The agent states that the runs of a matrix have reached: in all runs together, and in the runs of each cell."""
 
     def __init__(self) -> None:
         self._runs = 0
@@ -57,8 +57,8 @@ class CoverageTally:
         self._by_point[point].add(reached)
 
     def tried(self, matrix: Matrix, runs: int) -> MatrixCoverage:
-        """Return the coverage of the runs so far. `runs` is the number of all runs. It includes runs of earlier
-        commands, whose coverage is unknown.
+        """Return the coverage of the runs so far. `runs` is the number of all runs, including those of earlier
+        commands. The coverage of the earlier runs is unknown.
         """
         if runs > self._runs:
             self._reached.untold = f"an earlier command played {runs - self._runs} of {runs} runs"

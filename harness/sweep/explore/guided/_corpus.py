@@ -67,8 +67,8 @@ NightName = Annotated[str, Field(max_length=40)]
 
 
 class Finding(BaseModel):
-    """A bad verdict of one kind. `first` and `last` are the start times of the first and the last night in which runs
-    showed it.
+    """A bad verdict of one kind. `first` and `last` are the start times of two nights: the first and the last one with
+    a run that showed the finding.
     """
 
     model_config = ConfigDict(extra="ignore")

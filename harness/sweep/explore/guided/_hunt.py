@@ -56,7 +56,9 @@ class DigestSet:
 ROUND = 64
 """Number of runs in a round."""
 MOST_KEPT = 3000
-"""Maximum number of stored scenarios. Above it, the scenario that is least likely to lead to new states is removed."""
+"""Maximum number of stored scenarios. If there are more, the hunt removes the scenario that is least likely to lead to
+new states.
+"""
 MOST_FAILED = 100
 MAX_PATTERNS = 100_000
 """Maximum number of stored patterns of failed votes, which take 50 MB. Further patterns do not count as new."""
@@ -157,8 +159,8 @@ class Hunt:
     """The first runs that have no verdict, with the reasons. `failures` is the number of all runs without a verdict."""
     _dropped: list[CandidateRun] = field(default_factory=list)
     _known_divergences: set[Divergence] = field(default_factory=set)
-    """The known ways in which the chains of an idle swarm can differ. The first run with a new one is played again with
-    a final reconcile, to see whether the chains become equal.
+    """The known ways in which the chains of an idle swarm can differ. If a run ends with a new one, the hunt plays the
+    run again with a final reconcile, to see whether the chains become equal.
     """
     _known_patterns: set[TimerPatterns] = field(default_factory=set)
     """The known patterns of failed votes. The first run with a new pattern is stored."""
@@ -254,11 +256,11 @@ class Hunt:
         return CandidateRun(document, kept.candidate.seed if rng.random() < 0.8 else rng.randrange(SEEDS))
 
     def _pick(self, worth: Sequence[float]) -> KeptRun:
-        """Choose a stored document at random. In half of all cases, choose one of the newest documents. A share
-        `NEAR_LIVELOCK` of the other cases chooses a document with a new pattern of failed votes, if there is one. The
-        remaining cases prefer documents with a high expected benefit.
+        """Choose a stored document at random.
 
-        `worth` contains cumulative sums of the expected benefits.
+        In half of all cases, choose one of the newest documents. In a share `NEAR_LIVELOCK` of the other cases, choose
+        a document with a new pattern of failed votes, if such a document exists. In the remaining cases, prefer
+        documents with a high expected benefit. `worth` contains cumulative sums of the expected benefits.
         """
         if self.rng.random() < 0.5:
             return self.rng.choice(self.kept[-NEWEST:])

@@ -125,7 +125,7 @@ def _one_repetition(pattern: Sequence[str]) -> Sequence[str]:
 
 APPROVED = (ON_TIMER["voting"].name, "approved")
 MOST = 16
-"""Maximum number of timers in a pattern. Of a longer pattern, only the last timers are kept."""
+"""Maximum number of timers in a pattern. If a pattern is longer, only its last timers are kept."""
 
 TimerPatterns = tuple[tuple[str, ...], ...]
 """The timers that expired in each agent, in order of time."""
@@ -172,7 +172,9 @@ MOST_BLOCKS = 12
 nothing about the value of a run.
 """
 LAST_S = 240.0
-"""Minimum of the mission second up to which agents complete blocks. It can be later in long scenarios."""
+"""Latest mission second at which a changed scenario may complete a block. If an initial document lasts longer, its
+duration is the limit instead.
+"""
 CLEARED_S = 0.001
 """Seconds between the removal of all network conditions and the end of the mission."""
 LONGEST_GAP_S = 40.0
@@ -296,8 +298,8 @@ def _as_json(document: Document) -> Document:
 
 
 def _initial_document(scenario: Scenario, completing: Sequence[RecordedEvent]) -> Document:
-    """Return a document in which one event completes each of these blocks. All other parts come from the scenario, so
-    message losses and latencies stay random.
+    """Return a document that completes these blocks, each with a single event. All other parts come from the scenario,
+    so message losses and latencies stay random.
     """
     document = document_of(scenario)
     largest = at(document, "settings.max_event_bytes") or Settings().max_event_bytes

@@ -35,8 +35,8 @@ DELAYS_S = (0.0, 0.06, 0.2, 1.0, 4.99, 5.02, 9.99, 10.02, 15.0, 20.0)
 after a timer expiry, or after a whole round.
 """
 LATE_S = (0.001, 0.01, 0.03, 0.06, 0.2, 0.5)
-"""Delays for timers in seconds. They are long enough for the timer to expire after a message or after another timer.
-The longest delay is allowed for a correct machine.
+"""Delays for timers in seconds. With such a delay, a timer may expire after a message or another timer that it would
+otherwise precede. Even on a correct machine, timers can be late by the longest of these delays.
 """
 
 Change = Callable[[Document, Random], Document]
@@ -205,8 +205,8 @@ def _with_fate(document: Document, fate: Document, rng: Random) -> Document:
 
 
 def _choose_messages(document: Document, rng: Random) -> Document:
-    """Choose the messages to which a delivery rule applies, at random: the type of the messages, the sender, a number
-    or a time, and one receiver or all.
+    """Choose messages at random, and return the keys of a delivery rule for these messages. The keys select a message
+    type, a sender, and a number or a time of the message. In some cases, they also select one receiver.
     """
     which: Document = {
         "message": rng.choice(MESSAGES),
@@ -348,8 +348,8 @@ def _splice(document: Document, other: Document, rng: Random) -> Document:
 
 
 def _moment(document: Document, rng: Random) -> float:
-    """Choose a mission second at random. It is near the time of an event or timeline entry, near the expiry of a timer
-    that starts then, or anywhere in the mission.
+    """Choose a mission second at random. In some cases, it can be anywhere in the mission. In the other cases, it is
+    close to an event or a timeline entry, or later by the duration of one to three timers.
     """
     known = [event["at_s"] for event in script(document)]
     known += [entry["at_s"] for entry in timeline(document)]

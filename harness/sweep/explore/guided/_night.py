@@ -56,9 +56,9 @@ class NightProgress:
     """Functions that show the progress to the user."""
 
     on_progress: Callable[[int, int, int], None] = lambda runs, states, findings: None
-    """A function that gets the numbers of runs, agent states and findings so far."""
+    """A function that receives the numbers of runs, agent states and findings so far."""
     on_event: Callable[[str], None] = lambda words: None
-    """A function that gets a text about an event of the search, such as a new finding."""
+    """A function that receives a text about an event of the search, such as a new finding."""
 
 
 @dataclass
@@ -253,7 +253,9 @@ class _NightRun:
         return time.monotonic() >= self._ends_s or self._night.hunt.runs >= self._most_runs
 
     def _kept_runs(self, runs: Iterator[tuple[CandidateRun, bool]]) -> Iterator[CandidateRun]:
-        """Yield the runs that are stored. Before that, write each of these runs and each new finding to its file."""
+        """Write each stored run to its file, and then yield the run. Also write each new finding to its file. Stop when
+        the night is over.
+        """
         night, hunt = self._night, self._night.hunt
         for candidate, is_kept in runs:
             night.grow()
