@@ -3,13 +3,13 @@ decision.
 
 An agent adapts its chain to the chains of its neighbours in a process called reconcile. A reconcile starts when a vote
 fails, or when a query of another agent shows that the chains differ. Two idle agents send nothing, so their chains stay
-different, and this alone is no violation. A difference is a violation under two conditions: the network was fully
+different. This alone is no violation. A difference is a violation under two conditions: the network was fully
 connected, and the agent with the different chain completed a reconcile that began after the last change of any other
 chain. In all other cases the checks return `not applicable`.
 
-The system consists of the agents that ran until the end. An agent that was switched off earlier neither sends nor
-receives blocks. If all agents were switched off, the system consists of all of them. A reconcile then gives a chance to
-agree only if it happened while all agents ran.
+The checks compare the agents that ran until the end. An agent that was switched off earlier neither sends nor receives
+blocks. If all agents were switched off, the checks compare all of them. A reconcile then gives a chance to agree only
+if all agents ran during the reconcile.
 """
 
 import math
@@ -112,10 +112,9 @@ def describe_absent_agents(evidence: Evidence) -> str:
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return those of the `differing` agents that had a chance to agree.
-
-    Such an agent completed a reconcile that began after the network became fully connected and after the last change of
-    any other chain. During the reconcile, all judged agents ran without a pause, and no other agent was present.
+    """Return those of the `differing` agents that had a chance to agree. Such an agent completed a reconcile that began
+    after the network became fully connected and after the last change of any other chain. During the reconcile, all
+    judged agents ran without a pause, and no other agent ran.
     """
     since = evidence.connected_since_s
     if since is None:
@@ -142,5 +141,7 @@ def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]
 
 
 def _any_was_paused(evidence: Evidence, from_s: float, until_s: float) -> bool:
-    """Return true if an agent was paused in this interval. A query sent during a pause does not reach all agents."""
+    """Return true if an agent was paused in this interval. In this case, a query of a reconcile may not have reached
+    all agents.
+    """
     return any(evidence.was_paused(agent_id, from_s, until_s) for agent_id in evidence.present)

@@ -39,8 +39,8 @@ class TraceObservation:
 
 @dataclass(slots=True)
 class ReplayedIncarnation:
-    """An agent between two restarts, replayed from its trace: the hashes of the blocks that the agent held at the end,
-    and all observations of errors.
+    """The replayed trace of one incarnation of an agent (the time between two restarts). It contains the hashes of the
+    blocks that the agent held at the end, and all observations of errors.
     """
 
     trace: Trace
@@ -56,8 +56,8 @@ class ReplayedIncarnation:
     completed: list[str] = field(default_factory=list)
     sent: int = 0
     unknown: bool = False
-    """True if the trace contains unknown changes of blocks. After the first of them, the replay does not know which
-    blocks the agent holds.
+    """True if the trace contains unknown changes of blocks. After the first unknown change, the replay does not know
+    which blocks the agent holds.
     """
     impossible: list[TraceObservation] = field(default_factory=list)
     """Changes in the trace that are impossible, such as the removal of a block that the agent does not hold."""

@@ -59,8 +59,8 @@ class _UnfinishedOperation:
     due_s: float = math.inf
     """Mission second until which the next step must follow. Infinity if no vote or reconcile is in progress."""
     was_late: bool = False
-    """True if the next step was overdue, but the agent's computer may have been suspended. The agent then got more
-    time.
+    """True if the next step was overdue, but the agent's computer may have been suspended. In this case, the check
+    extends the time limit once.
     """
 
     def begin(self, line: int, now: float) -> None:

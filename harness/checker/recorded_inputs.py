@@ -1,10 +1,10 @@
-"""Decode the recorded inputs of an agent: datagrams, events, encrypted event data, and the states that it stored on
-disk.
+"""Decode the recorded inputs of an agent: datagrams, events, encrypted event data, and the states that the agent stored
+on disk.
 
-The module also computes the mission second at which an agent sent a message that its trace contains. A trace contains
-the time of the handler run. With the setting `answer_spread_s`, the agent sends an answer later, after a wait that
-CONTRACT.md defines. This module computes the wait independently, because an error of the agent under test must not
-affect the check.
+The module also computes the mission second at which an agent sent a message. The trace of the agent contains only the
+time of the handler run that produced the message. With the setting `answer_spread_s`, the agent sends an answer later,
+after a wait that CONTRACT.md defines. This module computes the wait independently, because an error of the agent under
+test must not affect the check.
 """
 
 import base64

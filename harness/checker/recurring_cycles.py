@@ -3,8 +3,8 @@ traces are the evidence.
 
 A trace shows a cycle if it ends with several repetitions of the same sequence of handler runs. In each repetition, the
 chain and the numbers of blocks in deque and stack are the same. A trace shows a standstill if the agent is not idle,
-but ran no handler for longer than its longest timer. An agent that makes progress changes its chain, so its trace shows
-neither.
+but ran no handler for longer than its longest timer. The trace of an agent that makes progress shows neither a cycle
+nor a standstill, because the agent changes its chain.
 """
 
 from collections import defaultdict

@@ -123,9 +123,7 @@ class SignatureChecks:
 
     def find_head_error(self, export: Export) -> str | None:
         """Return a phrase with the reason why the signed head of an export is not valid. Return None if the head is
-        valid or missing.
-
-        The head may be missing, because agents of earlier versions export no head.
+        valid. Also return None for an export without a head, because agents of earlier versions export no head.
         """
         head, public_key = export.head, self._keys.vehicles.get(export.agent_id)
         if head is None:

@@ -172,7 +172,8 @@ def _timer_expired_early(
     """Return the timer whose early expiry explains the received messages and the status. Return None if no early expiry
     explains them.
 
-    The search gives expiries to the reference. Afterwards, the reference is no longer in the state of the agent.
+    To find this timer, the function lets timers of the reference expire. Afterwards, the state of the reference
+    therefore differs from the state of the agent.
     """
     sent, first = list(expected), next_timer_name(model)
     for _ in range(MAX_EARLY_TIMERS):

@@ -2,7 +2,8 @@
 SOCKET PORT...`.
 
 The program runs in the network namespace of a vehicle. It binds a UDP socket to each port, passes all of them to the
-harness through the Unix socket SOCKET, and ends. A socket belongs to the namespace in which it was opened.
+harness through the Unix socket SOCKET, and ends. The harness can then use the sockets, because a socket always belongs
+to the namespace in which it was opened.
 """
 
 import socket

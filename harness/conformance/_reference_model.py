@@ -1,8 +1,8 @@
 """Run the reference implementation next to the agent under test, and save and restore its state.
 
-The reference is that of the step judge (`harness.checker.reference`). It receives the same inputs as the agent under
-test. The inputs are computed from the reference's state, which contains the agent's real blocks with the timestamps of
-the agent's clock.
+The step judge uses the same reference implementation (`harness.checker.reference`). The reference receives the same
+inputs as the agent under test. The inputs are computed from the reference's state, which contains the agent's real
+blocks with the timestamps of the agent's clock.
 """
 
 from collections import deque
@@ -196,8 +196,8 @@ class ModelSnapshot:
 
 
 def _sorted(part: dict[str, Any]) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Divide the attributes of an object into two groups, and return both. The first group contains the immutable
-    attributes, and the second one contains copies of the other attributes, which are containers.
+    """Divide the attributes of an object into two groups, and return both groups: the immutable attributes, and copies
+    of all other attributes, which are containers.
     """
     containers = [(name, _copied(value)) for name, value in part.items() if type(value) in CONTAINERS]
     return {name: value for name, value in part.items() if type(value) not in CONTAINERS}, containers

@@ -152,8 +152,8 @@ class UdpLab:
     def mission(
         self, variant: SettingsVariant, port: int, speedup: float, keys: Mapping[str, Any] = NO_KEYS
     ) -> dict[str, Any]:
-        """Return the mission file of an agent on this port. `keys` contains keys that replace or extend those of the
-        file.
+        """Return the mission file of an agent on this port. `keys` contains additional keys of the file, and keys with
+        other values.
         """
         address = self.lab.addresses[AGENTS_VEHICLE]
         return mission(variant, address=address, broadcast=self.lab.broadcast, port=port, speedup=speedup, keys=keys)

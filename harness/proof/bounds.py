@@ -167,12 +167,12 @@ class Bounds:
 
     @property
     def alike(self) -> bool:
-        """True if two states count as one state when exchanging agents converts one into the other."""
+        """True if two states that differ only by an exchange of agents count as one state."""
         return self.nameless and not self.stagger
 
     @property
     def blocks_alike(self) -> bool:
-        """True if two states count as one state when exchanging blocks converts one into the other."""
+        """True if two states that differ only by an exchange of blocks count as one state."""
         return self.nameless and self.clocks_any
 
     @property

@@ -18,8 +18,8 @@ EMPTY_SECTION = re.compile(rb"[ \t]*(?:\{[ \t]*\})?[ \t]*(?:#.*)?\s*")
 
 
 def is_selected(path: Path, config: pytest.Config) -> bool:
-    """Return true if a path that pytest was given contains the file. For example, `pytest .` selects all files below
-    the current directory.
+    """Return true if the user selected the file with a path in the pytest command, or with the option `testpaths` of
+    the configuration. For example, `pytest .` selects all files below the current directory.
     """
     if PLACES not in config.stash:
         config.stash[PLACES] = _places(config)

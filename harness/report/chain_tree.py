@@ -86,8 +86,9 @@ def holders(exports: Mapping[int, Export]) -> dict[str, list[int]]:
 
 def marks(inception: ChainTreeNode, names: Mapping[str, str], *, abridged: bool) -> ChainTreeMark:
     """Return the mark of the inception block. All other marks can be reached from this mark. `names` maps the hashes of
-    blocks to their names. Each mark above a block shows the chains of some agents. The marks are sorted by the lowest
-    ID of these agents.
+    blocks to their names.
+
+    Each mark above a block shows the chains of some agents. The marks are sorted by the lowest ID of these agents.
     """
     root = ChainTreeMark("block", [inception], ["inception block"], inception.holders)
     to_grow = [(root, inception)]
@@ -247,8 +248,8 @@ class _SubtreeOutline:
         )
 
     def merged_with(self, other: "_SubtreeOutline", x: float) -> "_SubtreeOutline":
-        """Merge two outlines, and return the result. The root of `other` is `x` to the right of this root. The caller
-        may not use the two old outlines again.
+        """Merge two outlines, and return the result. The root of `other` is `x` to the right of this root. The two old
+        outlines become invalid, so the caller must not use them again.
         """
         other.shift += x
         large, small = (self, other) if len(self._rows) >= len(other._rows) else (other, self)

@@ -90,8 +90,8 @@ class KeyDifference:
 
 
 def differing_keys(a: Any, b: Any, key: str = "") -> Iterator[KeyDifference]:
-    """Yield each scenario key whose value differs, in the order of `a`. For nested values, this is the innermost key.
-    Two lists with different lengths give one difference for the whole list.
+    """Yield each scenario key whose value differs, in the order of `a`. For nested values, yield the innermost key that
+    differs. For two lists with different lengths, yield only the key of the list.
     """
     if isinstance(a, dict) and isinstance(b, dict):
         pairs = [(name, a.get(name), b.get(name)) for name in {**a, **b}]

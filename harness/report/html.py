@@ -28,8 +28,8 @@ PAGE_STYLE = PALETTE + (_HERE / "page.css").read_text(encoding="utf-8")
 
 
 class _TemplateCache(BytecodeCache):
-    """A cache that stores compiled templates in the directory in which Python caches this module. To compile the
-    template of a report takes longer than to render it.
+    """A cache of compiled templates. It is necessary because compiling the template of a report takes longer than
+    rendering it. The cache stores its files in the directory in which Python caches this module.
     """
 
     def _file(self, bucket: Bucket) -> Path:

@@ -96,7 +96,7 @@ def _handler_runs(
 
 def _lines_by(evidence: Evidence, incarnation: ReplayedIncarnation, counted: HandlerRuns) -> tuple[int, int]:
     """Return the minimum and maximum number of trace lines that the agent can have written when it reported its
-    counters. The time of the report is known only approximately.
+    counters. The two numbers differ, because the time of the report is known only approximately.
     """
     if in_virtual_time(incarnation.trace):
         return len(incarnation.runs), len(incarnation.runs)

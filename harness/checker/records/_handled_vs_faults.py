@@ -138,12 +138,12 @@ class _CutIntervals:
 
 
 def _cuts(evidence: Evidence) -> _CutIntervals | None:
-    """Return the intervals in which links lost all messages. Return None if there are none, or if a message may arrive
-    over such a link.
+    """Return the intervals in which links lost all messages. Return None if there are no such intervals, or if messages
+    may arrive in spite of them.
 
-    A message may arrive in three cases. The scenario decides the fate of each message in its section `fates`. The
-    network emulator netem loses the first copy of a message, but passes the second one. On a shared channel, the
-    message waits until after the cut.
+    Messages may arrive in spite of such an interval in three cases. The scenario decides the fate of each message in
+    its section `fates`. The network emulator netem loses the first copy of a message, but passes the second one. On a
+    shared channel, a message waits until after the interval.
     """
     if evidence.has_fates or evidence.has_channel or any(link.duplicate > 0 for link in evidence.requested_links or ()):
         return None

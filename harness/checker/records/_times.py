@@ -1,9 +1,9 @@
 """Compare the times of exports, events and handler runs with the time at which the run ended.
 
-An agent exports its chain at its own end: when it is switched off, or when the run ends. An event has the timestamp of
-its logging. Virtual time has one clock, so these times are equal. Real processes export one after another, and the
-machine may be busy. Their exports and last handler runs may therefore be up to `END_WALL_S` later than the end of the
-run.
+An agent exports its chain when it ends: when it is switched off, or when the run ends. The timestamp of an event is the
+time at which the agent logged the event. In virtual time there is only one clock, so the compared times are equal. Real
+processes export one after another, and the machine may be busy. Their exports and last handler runs may therefore be up
+to `END_WALL_S` later than the end of the run.
 """
 
 from collections.abc import Iterator

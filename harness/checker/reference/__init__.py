@@ -1,7 +1,7 @@
-"""The independent implementation of the protocol. The checker compares each step of an agent with it.
+"""The independent implementation of the protocol. The checker compares each step of an agent with this implementation.
 
-`algorithms` is a transcription of Algorithms 1-20. Its author worked from the thesis and from
-`docs/reference/readings.md`, the interpretations of its ambiguous passages, and did not see `ucp`. The two
+The module `algorithms` is a transcription of Algorithms 1-20. The author of the module worked from the thesis and from
+`docs/reference/readings.md`, which interprets the ambiguous passages of the thesis, and did not see `ucp`. The two
 implementations share only the message codec and the hashes. An edit of `ucp` therefore changes the agents, but not the
 judge.
 """

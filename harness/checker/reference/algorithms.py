@@ -1,14 +1,15 @@
 """The reference implementation: a literal transcription of Algorithms 1-20 (Chapter 3 of the thesis).
 
 This module judges recorded runs of other implementations, so it follows the order and the words of the pseudo-code,
-even if shorter code were possible. Its author worked from the thesis and the interpretations of its ambiguous passages
-("readings"), and did not see `ucp`. "Reading 4" in a docstring means number 4 of docs/reference/readings.md.
+even if shorter code were possible. The author of the module did not see `ucp`. The author worked from the thesis and
+from interpretations of its ambiguous passages ("readings"). "Reading 4" in a docstring means number 4 of
+docs/reference/readings.md.
 
 Each algorithm is one function. It reads and changes a `ReferenceState` and returns the name of the branch that it took.
 An input is a message, an expired timer, a logged event or a command. A handler is atomic: it runs to its end, then the
 local events that it triggered run in order, then the next input follows. The locks of the thesis are therefore not
-needed (reading 15). The functions do no I/O and read no clock. They append messages to `ReferenceState.outbox`. The
-time comes with each input.
+needed (reading 15). The functions do no I/O and read no clock. They append messages to `ReferenceState.outbox`. Each
+input contains the current time.
 """
 
 from collections.abc import Callable

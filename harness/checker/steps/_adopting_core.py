@@ -27,7 +27,9 @@ from ucp.trace import HandlerRun, SentMessage
 
 
 class StateBeforeStep(NamedTuple):
-    """The parts of the state before a step that the recorded changes of the step do not determine."""
+    """Parts of the state before a step. They must be saved, because the recorded changes of the step are not sufficient
+    to compute them afterwards.
+    """
 
     stack: list[Block]
     current_block: bytes | None
@@ -75,7 +77,7 @@ class AdoptingCore(_Core):
         yield from (message for _, message in self.outbox)
 
     def be_idle_with(self, chain: Iterable[Block], current_block: bytes, sequence: int) -> None:
-        """Set the state to that of an idle agent that holds only this chain."""
+        """Put the core into the state of an idle agent that holds only the blocks of this chain."""
         for block in chain:
             self.commit(block)
             if block.agent_id == self.agent_id:
@@ -145,8 +147,8 @@ class AdoptingCore(_Core):
         """Undo the changes that the last step made to blocks and timers. The votes are not restored, because `adopt`
         replaces them.
 
-        `before` is the result of the method `before`. It is None if the recorded changes are sufficient to undo the
-        step.
+        `before` contains the data that the method `before` returned. It is None if the recorded changes are sufficient
+        to undo the step.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:
@@ -244,8 +246,8 @@ class AdoptingCore(_Core):
                 timer.start(self.now, self._duration(timer))
 
     def _asked(self, message: Message) -> Timer | None:
-        """Set the counters of the answers to `message` to their initial values. Return the timer that limits the wait
-        for these answers. Return None if the message expects no answer.
+        """Prepare the core to count the answers to `message`. Return the timer that limits the wait for these answers.
+        Return None if the message expects no answer.
         """
         match message:
             case BlockAddRequest():

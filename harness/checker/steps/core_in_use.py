@@ -1,7 +1,7 @@
 """Make the installed agent core `ucp.agent` comparable with the records of an agent.
 
-The verdict on agents comes from the reference. In two cases the installed core also repeats the recorded steps. A
-debugger can then stop in the handlers of `ucp`, and `bisect` can compare the cores of two commits.
+The verdict on agents comes from the reference. The installed core repeats the recorded steps for two other purposes: a
+debugger can stop in the handlers of `ucp`, and `bisect` can compare the cores of two commits.
 """
 
 from dataclasses import asdict

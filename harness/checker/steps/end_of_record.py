@@ -2,9 +2,9 @@
 writes no line for this handler.
 
 If `run.json` exists, it contains the reason. A crash in a handler is a deviation, because no Algorithm ends in an
-error. For records from the field, only other agents' records can show that the mission continued after the last line.
-They do not show whether the agent died in a handler or lost its power. The sentence therefore names the next input and
-both possibilities.
+error. For records from the field, only the records of other agents can show that the mission continued after the last
+line. The records do not show whether the agent died in a handler or lost its power. The description therefore names the
+next input and both possible causes.
 """
 
 import math
@@ -61,9 +61,10 @@ def failure(recorded: AgentRecord | None) -> str | None:
 
 
 def last_line(trace: Trace, incarnations: int | None = None) -> tuple[int, float]:
-    """Return the line number and the mission second of the last handler run. The header is line 1. If `incarnations` is
-    given, only this number of incarnations from the start of the trace counts. An incarnation is the time between two
-    restarts.
+    """Return the line number and the mission second of the last handler run. The header is line 1.
+
+    If `incarnations` is given, the function considers only this number of incarnations, from the start of the trace. An
+    incarnation is the time between two restarts.
     """
     line, t = 1, 0.0
     for incarnation in islice(trace.incarnations(), incarnations):

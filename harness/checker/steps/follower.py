@@ -232,14 +232,15 @@ class StepComparer:
         return bool(core.changes or core.outbox or core.started or core.triggered) or branch in COUNTING
 
     def play_lost_message(self, sender: int, message: Message, at_s: float) -> bool:
-        """Let the reference handle a message that the trace lacks. Return true if the message changed no block, because
-        a trace can then lack its line without a contradiction.
+        """Let the reference handle a message that the trace lacks. Return true if the message changed no block. Only
+        then can a trace lack the line of the message without a contradiction.
         """
         return self._play_lost(self._on_message[type(message)], at_s, sender, message)
 
     def play_lost_expiry(self, timer_name: str, at_s: float) -> bool:
         """Let a timer of the reference expire, although the trace has no line for the expiry. Return true if the timer
-        was due and its handler changed no block, because a trace can then lack this line without a contradiction.
+        was due and its handler changed no block. Only then can a trace lack the line of the expiry without a
+        contradiction.
         """
         timer = self._timers[timer_name]
         if timer.deadline is None or timer.deadline > self._header.local(at_s) + self._header.early_s:
@@ -248,8 +249,8 @@ class StepComparer:
         return self._play_lost(self._implementation.on_timer[timer_name], at_s)
 
     def play_lost_local_event(self, at_s: float) -> bool:
-        """Run the handler of the next local event. Return true if an event waited and its handler changed no block,
-        because a trace can then lack this line without a contradiction.
+        """Run the handler of the next local event. Return true if an event waited and its handler changed no block.
+        Only then can a trace lack the line of the handler run without a contradiction.
         """
         if not self._core.triggered:
             return False
@@ -389,8 +390,8 @@ class StepComparer:
         return is_lost
 
     def _after_a_pause(self, deadline: float) -> str:
-        """Return a phrase for the end of a sentence if a handler paused the phase 3 timer after its start. Return an
-        empty text otherwise.
+        """If a handler paused the phase 3 timer while it was running, return a phrase about this pause. The phrase
+        completes a sentence. Otherwise return an empty text.
         """
         line, paused_at = self._paused
         if paused_at < deadline - self._header.settings.phase3_timeout_s:

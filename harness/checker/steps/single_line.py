@@ -65,8 +65,8 @@ class OtherRecords(Protocol):
         """Return true if the agent was reconciling at its last trace line before this mission second."""
 
     def beginnings(self, number: int) -> Iterable[str]:
-        """Return the beginnings of line `number` of the trace file that end where a disk block begins. A line inside
-        one disk block has no such beginning.
+        """Return the possible beginnings of line `number` of the trace file, if damage can cut the line only at the end
+        of a disk block. The result is empty if the whole line is inside one disk block.
         """
 
 
@@ -92,7 +92,7 @@ def damage_that_explains(
     """Return a phrase for the damage to a trace that explains the difference, such as "a line is missing". Return None
     if no damage explains it.
 
-    `before` is the comparison in its state before the line. The function does not change it.
+    `before` is the comparison in its state before the damaged line. The function does not change this object.
     """
     following = following[:LINES_AFTER]
     if _is_one_character_off(before, deviation, line, following, others):
@@ -121,9 +121,11 @@ def damage_that_explains(
 def _agrees(
     follower: StepComparer, lines: Sequence[Line], others: OtherRecords | None = None, lost: int = MAX_FURTHER
 ) -> bool:
-    """Return true if the reference agrees with the lines. A block whose recorded events differ from the logged events
-    ends the comparison, because another lost line may be the cause. If `others` is given, up to `lost` further lines
-    may be missing between the lines.
+    """Return true if the reference agrees with the lines. If `others` is given, up to `lost` further lines may be
+    missing between the lines.
+
+    The comparison ends early, with the result true, at a block whose recorded events differ from the logged events.
+    Another lost line may be the cause of this difference.
     """
     start = None if others is None or not lost else follower.copy()
     for place, (number, run) in enumerate(lines):

@@ -177,9 +177,8 @@ class CaseBench:
         directory: Path | None = None,
         port: int | None = None,
     ) -> AsyncIterator[BenchAgent]:
-        """Start an agent and wait until it is ready. If `started` is true, also start its mission.
-
-        `keys` contains keys that replace those of the mission file. The other arguments are those of `program`.
+        """Start an agent and wait until it is ready. If `started` is true, also start its mission. `keys` contains keys
+        with other values than in the usual mission file. The other arguments are passed to `program`.
         """
         async with self.program(keys, prepare=prepare, directory=directory, port=port) as alone:
             await alone.process.ready()

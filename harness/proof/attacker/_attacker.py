@@ -22,7 +22,7 @@ from ucp.messages import BlockAddRequest, BlockResponse, CommitBlock, Message
 from ucp.state import AgentState
 
 MOST_KNOWN = 200_000
-"""Maximum number of cached lists of messages. Above it, the cache is emptied."""
+"""Maximum number of cached lists of messages. When the cache exceeds this number, it is emptied."""
 
 
 class _KnowledgeFromAgent(NamedTuple):

@@ -2,7 +2,7 @@
 
 The effect of a message depends only on three properties: whether the agent holds a hash, which of two timestamps is
 older, and whether the answer is yes or no. docs/explanation/proof.md explains why these messages are enough. A test
-compares their effects with those of random messages.
+compares the effects of these messages with the effects of random messages.
 """
 
 from collections.abc import Iterable, Iterator

@@ -45,11 +45,11 @@ class AttackEntries:
             below = self._chains[chain_hash] = (*below, block.block_hash)
 
     def lie(self, receiver: int, number: int, at_s: float) -> list[Document]:
-        """Add a message of the attacker, and return a list with its timeline entry. The entry is incomplete until the
-        method `word` completes it.
+        """Add a message of the attacker. Return a list with a new timeline entry, which is incomplete until the method
+        `word` completes it.
 
-        If the previous message has the same content and time, the receiver is added to its entry, and the list is
-        empty.
+        If the previous message of the attacker has the same content and time, add the receiver to the entry of the
+        previous message instead, and return an empty list.
         """
         message = self._local.messages[number]
         if self._lies and (self._lies[-1][0]["at_s"], self._lies[-1][1]) == (at_s, message):

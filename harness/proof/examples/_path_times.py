@@ -121,8 +121,8 @@ class BlockAges:
         self._events.append(len(self._events))
 
     def renumber(self, blocks: Ordinals) -> None:
-        """Change the numbers of the blocks after a step. The given blocks become 1, 2 and so on. Blocks that no agent
-        holds follow them.
+        """Change the numbers of the blocks after a step. The given blocks receive the numbers 1, 2 and so on. All other
+        blocks, which no agent holds, receive the following numbers.
         """
         if blocks:
             rest = [ordinal for ordinal in range(1, len(self._events) + 1) if ordinal not in blocks]

@@ -106,8 +106,8 @@ class _NumberTranslator:
         self._new_definitions: Definitions = []
 
     def code(self, ours: int) -> int:
-        """Return the number that the other process uses for a number of this process. If this number is unknown, return
-        a value below -1 that encodes the number of this process.
+        """Convert the number of a state in this process to a number for the other process. The result is the other
+        process's own number, if it is known. Otherwise it is a value below -1 that encodes the number in this process.
         """
         code = self._codes.get(ours)
         if code is None:

@@ -77,8 +77,8 @@ class NumberedBlocks:
         return frozenset().union(*(self.named(digest) for digest in hashes if isinstance(digest, bytes)))
 
     def of(self, snapshot: Snapshot) -> Ordinals:
-        """Return the numbers of the blocks that occur in an agent's state, each once. The order does not depend on
-        which blocks they are, so states that differ only in their blocks list corresponding blocks in the same order.
+        """Return the numbers of the blocks that occur in an agent's state, without repetition. If two states differ
+        only in their blocks, corresponding blocks are at the same position in both results.
         """
         return tuple(dict.fromkeys(self._all(snapshot)))
 

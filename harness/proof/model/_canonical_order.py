@@ -34,7 +34,7 @@ class OrderedAgents(NamedTuple):
 
 
 MOST_KNOWN = 200_000
-"""Maximum number of cached orders. Above it, the cache is emptied."""
+"""Maximum number of cached orders. When the cache exceeds this number, it is emptied."""
 MOST_ORDERS = 120
 """Maximum number of orders of similar agents that are compared. If more orders exist, equivalent states may count as
 several states.

@@ -35,7 +35,7 @@ One number encodes the remaining faults. This number has a bit for each fault an
 remaining numbers of forged messages, coincidences and losses.
 """
 MOST_KNOWN = 200_000
-"""Maximum number of cached results for actions at one moment. Above it, the cache is emptied."""
+"""Maximum number of cached results for actions at one moment. When the cache exceeds this number, it is emptied."""
 ONCE = (*FAULTS, "captured")
 """Faults that can happen at most once in a run. Each has a bit in the state, which is set while the fault can still
 happen.

@@ -2,9 +2,9 @@
 and then agents receive all resulting messages.
 
 Several agents may act before they receive each other's messages, so their messages cross. The agents receive the
-messages in any order of the senders. Then they receive the answers to them, and so on until no agent sends a message. A
-receiver in a lossy network may lose any of the messages. If an agent sends several messages in one action, they arrive
-in order. Answers can overtake each other.
+messages in any order of the senders. Then the agents receive the answers to these messages, and so on until no agent
+sends a message. A receiver in a lossy network may lose any of the messages. If an agent sends several messages in one
+action, they arrive in order. Answers can overtake each other.
 
 For each agent, the results of all orders and all losses are computed once. In most cases there are only one or two
 different results.
@@ -30,7 +30,7 @@ ANSWERED = 2
 
 
 MOST_KNOWN = 200_000
-"""Maximum number of cached outcomes. Above it, the cache is emptied."""
+"""Maximum number of cached outcomes. When the cache exceeds this number, it is emptied."""
 MOST_SEEN = 500
 """Maximum number of states that a correct agent can reach by one round of messages. A faulty agent that counts messages
 without limit could reach more.
@@ -242,8 +242,8 @@ class InstantOutcomes:
         return tuple([item for item in started if item[0] in running])
 
     def _outcomes_of(self, local: int, heard: ReceivedMessages, lossy: bool, answered: bool) -> list[_Outcome]:
-        """Return the possible steps of an agent that receives these messages. Each step has an order of the messages
-        that leads to it.
+        """Return the possible steps of an agent that receives these messages. With each step, return an order of the
+        messages that leads to the step.
         """
         key = local, heard, lossy, answered
         outcomes = self._outcomes.get(key)

@@ -137,9 +137,8 @@ class LocalStates(KnownStates):
         return self.ends(local, timer)[result].step
 
     def ends(self, local: int, timer: int) -> list[TimerResult]:
-        """Return the possible results when a timer expires.
-
-        There are several results only if the agent compares the ages of blocks and any of them may be the oldest.
+        """Return the possible results when a timer expires. There are several results only if the agent compares the
+        ages of blocks and each of these blocks may be the oldest.
         """
         key = local, timer
         ends = self._ends.get(key)
@@ -355,8 +354,8 @@ class LocalStates(KnownStates):
         return pattern
 
     def about(self, local: int) -> Ordinals:
-        """Return the numbers of the blocks that occur in a state, each once. States that differ only in their blocks
-        list corresponding blocks in the same order.
+        """Return the numbers of the blocks that occur in a state, without repetition. If two states differ only in
+        their blocks, corresponding blocks are at the same position in both results.
         """
         about = self._about.get(local)
         if about is None:
@@ -398,10 +397,8 @@ class LocalStates(KnownStates):
         *,
         keep: bool = True,
     ) -> int:
-        """Store an agent's state and return its number. `taken` is its snapshot, and `before` is the snapshot before
-        the step.
-
-        If `keep` is true, the agent gets further inputs in this state.
+        """Store an agent's state and return its number. `taken` is the snapshot of the state, and `before` is the
+        snapshot before the step. If `keep` is true, the agent will receive further inputs in this state.
         """
         snapshot = self._parts.of(taken, before or {})
         if keep:

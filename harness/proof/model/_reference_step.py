@@ -1,8 +1,8 @@
 """Compare one step of an agent with the same step of the independent reference implementation.
 
-The reference is set to the state of the agent and gets the same input. Each step is therefore judged separately, even
-if a mistake in it has no later consequences. For the installed agent core, this compares the core with the reference in
-every state within the bounds.
+The reference is set to the state of the agent and receives the same input. Each step is judged separately. The
+comparison therefore finds a mistake in a step even if the mistake has no later consequences. If the agents run the
+installed agent core, a proof compares this core with the reference in every state within the bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from ucp.state import AgentState
 from ucp.trace import HandlerRun
 
 Give = Callable[[Any], None]
-"""The type of a function that gives an input to an agent, which is a `ucp.agent.Agent` or a `ReferenceAgent`."""
+"""The type of a function that gives an input to a `ucp.agent.Agent` or to a `ReferenceAgent`."""
 Make = Callable[[int, Callable[[], None]], Agent]
 """The type of a function that creates an agent with traces. Its arguments are the ID of the agent, and a function that
 the agent calls after each handler run.

@@ -275,8 +275,8 @@ class AgentStep(NamedTuple):
 
 
 class TimerResult(NamedTuple):
-    """A possible result when a timer expires. If `oldest` is given, the result occurs if this candidate of phase 2 is
-    the oldest one.
+    """A possible result when a timer expires. If `oldest` is given, it is a candidate of phase 2, and the result occurs
+    only if this candidate is the oldest one.
     """
 
     step: AgentStep
@@ -321,8 +321,8 @@ class SnapshotParts:
         return (agent_id, flaw, *[numbers[id(part)] for part in snapshot.values()])
 
     def anonymous(self, agent_id: int, flaw: PropertyViolation | None, snapshot: Snapshot) -> int:
-        """Return a number for a state that does not depend on which agents voted or answered. The number is the same on
-        all machines.
+        """Return a number for a state. States that differ only in which agents voted or answered have the same number.
+        The number is the same on all machines.
         """
         parts = [
             len(value) if name in NAMES_OF_OTHERS else self._digests[id(value)] for name, value in snapshot.items()

@@ -22,8 +22,8 @@ With faulty agents, the number of states can be infinite. Above the limit, the q
 MAX_CACHED = 200_000
 """Maximum number of states for which the number of votes is cached."""
 MAX_PATH_INSTANTS = 150
-"""Maximum number of steps of the swarm on a single path, including those of all votes. If a path is longer, all
-successors are explored instead.
+"""Maximum number of steps of the swarm on a single path, including the steps of all votes. If a path is longer, the
+search explores all successors instead.
 """
 
 
@@ -70,10 +70,8 @@ class ExtraVotes:
         return any(self._leads(after, votes - 1, instants + 1) for after in self._after_a_vote(fork))
 
     def _after_a_vote(self, fork: State) -> Iterator[State]:
-        """Yield the possible states after a vote of one agent. If several agents are in equal states, only one of them
-        votes.
-
-        The agents with the rarest chain are tried first.
+        """Yield the possible states after a vote of one agent. Of several agents in equal states, only one votes,
+        because the other votes have equal results. The agents with the rarest chain are tried first.
         """
         locals_, known = fork[AGENTS:], self._swarm.local.known
         alike = {

@@ -38,9 +38,10 @@ def _cyclic_parts(graph: StateGraph, check: Check) -> Iterator[list[int]]:
 
 
 def _with_exact_zones(graph: StateGraph, part: Sequence[int], check: Check) -> StateGraph:
-    """Explore a part of a graph again, starting from its states. Include only states whose agents are in local states
-    that occur in the part. Return the new graph, in which only equal states are one state. The first states of the
-    result are those of `part`.
+    """Explore a part of a graph again, starting from the states of `part`. Return a new graph, in which only equal
+    states are one state. Its first states are the states of `part`.
+
+    The exploration omits a state if the local state of one of its agents does not occur in the part.
     """
     exact = StateGraph(graph.swarm, exact=True)
     for number in part:

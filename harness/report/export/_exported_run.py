@@ -158,8 +158,8 @@ def read_log(source: str, path: Path, time: MissionTime, problems: list[str]) ->
 
 
 def _zone_s(ahead_s: float) -> float:
-    """Return the time zone of a log file as an offset from UTC in seconds. In this zone, the first line of the file is
-    nearest to the start of the mission. Return infinity if no zone matches, for example in virtual time.
+    """Return the time zone of a log file as an offset from UTC in seconds. It is the zone in which the first line of
+    the file is nearest to the start of the mission. Return infinity if no zone matches, for example in virtual time.
     """
     zone_s = round(ahead_s / _ZONE_STEP_S) * _ZONE_STEP_S
     return zone_s if abs(zone_s) <= _FURTHEST_ZONE_S else math.inf

@@ -1,11 +1,13 @@
 """Return tables of a run for notebooks: its handler runs and its blocks, as polars DataFrames.
 
 Each batch of records is converted to columns before the next batch is read. Memory therefore holds only the finished
-columns and one batch. `DataFrame.write_parquet` keeps a large table in a file.
+columns and one batch. `DataFrame.write_parquet` stores a large table in a file.
 
-polars is an optional dependency (extra `data`). Polars was chosen over pandas for three reasons. It writes Parquet
-itself, whereas pandas needs pyarrow and NumPy. Its columns have one declared type even with missing values. Its import
-takes a third of the time.
+polars is an optional dependency (extra `data`). Polars was chosen over pandas for three reasons:
+
+- Polars writes Parquet itself, whereas pandas needs pyarrow and NumPy.
+- A column has one declared type even with missing values.
+- The import of polars takes a third of the time.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -4,8 +4,8 @@ Each agent has a group of tracks: votes, reconciles with their phases, handler r
 arrow leads from the handler run that sent a message to each handler run that the message triggered. The swarm has
 counters of losses and chains, and a track of faults and log lines.
 
-The format is Perfetto's own protobuf. Chrome's JSON format is not suitable. Its arrows need slices with a duration, but
-a handler run has no duration.
+The format is Perfetto's own protobuf. Chrome's JSON format is not suitable, because its arrows need slices with a
+duration, but a handler run has no duration.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -88,8 +88,8 @@ class _MessageArrows:
         self._from: dict[tuple[int, int, float], list[int]] = {}
         self._to: dict[tuple[int, int, int, float], int] = {}
         self.backwards = 0
-        """Number of receipts that are earlier than the sending of their message, because the clocks of the agents
-        differ. The trace contains no arrows for these receipts.
+        """Number of messages that seem to be received before they were sent, because the clocks of the agents differ.
+        Each receiver counts separately. The trace contains no arrows for these receipts.
         """
         for message in messages:
             for receiver, at_s in message.receipts:

@@ -1,8 +1,8 @@
 """Serve the live page of a run in a separate process: `python -m harness.report.live DIRECTORY PORT`.
 
-A separate process does not delay the run, and a failure of it does not affect the run.
+The server is a separate process, so that it does not delay the run and its failure does not affect the run.
 `harness.report.live.server_process` describes the messages between the two processes. After the run the server
-continues while a page is open. It ends at once if the process of the run ends.
+continues while a page is open. If the process of the run ends, the server ends immediately.
 """
 
 import asyncio

@@ -56,11 +56,11 @@ not count.
 LINES_AT_ONCE_LATE = 50
 POLLS_UNTIL_REPORTED = 2
 """Number of polls for which a message waits before the page shows it. After this time, most receivers have recorded the
-message. If a receiver on a busy machine records it later, the page gets a change of the kind `h`.
+message. If a receiver on a busy machine records the message later, the page receives a change of the kind `h`.
 """
 MAX_BEHIND_S = 2.0
-"""Seconds of wall time. If the stream of changes is behind an active run by more than this time, it omits messages
-until it has caught up.
+"""Number of seconds of wall time. If the feed is behind an active run by more than this number, it omits messages until
+it has caught up.
 """
 MAX_KEPT = 100_000
 """Maximum number of messages for which further receivers can still be added on the page. The same limit applies to
@@ -131,7 +131,7 @@ class ChangeFeed:
         self._surroundings = NetworkAndVehicles(directory, self._roster)
         self._broadcasts: dict[tuple[int, int], _Broadcast] = {}
         self._reported: dict[tuple[int, int], _Broadcast] = {}
-        """The last messages that the page got, by sender and sequence number."""
+        """The last messages that were sent to the page, by sender and sequence number."""
         self._polls = 0
         self._leaves_out_messages = False
         self._messages_from_s = -1.0

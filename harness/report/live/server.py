@@ -43,7 +43,7 @@ from harness.report.live.feed import ChangeFeed, RunClock
 MAX_BYTES = 512 * 1024 * 1024
 CHUNK_BYTES = 256 * 1024
 FAR_BEHIND_BYTES = 4 * 1024 * 1024
-"""Number of bytes. A page that is behind an active run by more than this number skips frequent changes, such as
+"""Number of bytes. If a page is behind an active run by more than this number, it skips frequent changes, such as
 messages and positions, to catch up.
 """
 _LEFT_OUT = (b'["m"', b'["p"', b'["t"', b'["d"')

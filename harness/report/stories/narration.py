@@ -161,8 +161,8 @@ class StoryWriter:
         return f"completes {name}" if operation == "complete" else f"{operation[:-1]} {operation[-1]}{name}"
 
     def _missing_receivers(self, action: AgentReaction, sent: SentMessage) -> str:
-        """Return a note about the agents that a message should have reached but did not reach. If the message is an
-        answer, it should only reach the agent that sent the query.
+        """Return a note about the agents that did not receive a message, although they should have received it. An
+        answer should only reach the agent that sent the query.
         """
         meant = {action.sender} if sent.message in ANSWERS else {*self._roster} - {action.agent_id}
         missed = sorted(agent for agent in meant - action.receivers[sent.seq] if agent is not None)

@@ -179,10 +179,8 @@ def smallest_of(
     max_runs: int,
     on_step: Callable[[int, str], None],
 ) -> tuple[Document, str, bool]:
-    """Reduce a scenario document as long as `still` returns true for it.
-
-    Return the smallest document found, a text about the steps of the reduction, and true if the user interrupted the
-    search.
+    """Remove parts of a scenario document, as long as `still` returns true for the smaller document. Return the
+    smallest document found, a text about the steps of the reduction, and true if the user interrupted the search.
     """
     interrupted = False
     shrinker = Shrinker(

@@ -72,8 +72,8 @@ class _EventRecorder(MemoryRecorder):
         self.events: list[RecordedEvent] = []
         self.lost: list[LostMessage] = []
         self.sent: dict[tuple[int, int], LostMessage] = {}
-        """Sender and sequence number of a sent Commit Block message -> the entry for `lost`. The entry is added to
-        `lost` for each receiver that ignores the message.
+        """Sender and sequence number of a sent Commit Block message -> the entry that is added to `lost` for each
+        receiver that ignores the message.
         """
         self._last_of: dict[int, int] = {}
         self._counts: Counter[int] = Counter()

@@ -97,8 +97,8 @@ def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
     """Return a rule with which the network loses all messages of this type from this sender to this receiver at about
     this time.
 
-    The rule identifies the message by its time and not by a number. It therefore still matches this message when other
-    messages disappear from the run.
+    The rule identifies its message by a time and not by a number. The rule therefore still matches the same message
+    when other messages disappear from the run.
     """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}

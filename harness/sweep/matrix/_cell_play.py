@@ -78,7 +78,7 @@ class RunPlayer:
     judge: Judge = simulated
     """The function that carries out and judges simulated runs."""
     covers: bool = False
-    """True if the coverage of each run is measured. Simulated runs are then not given to `judge`."""
+    """True if the coverage of each run is measured. `judge` is then not called for simulated runs."""
     is_cancelled: Callable[[], bool] | None = None
     """A function that returns true if a run with real programs must end early. A run in a thread needs it, because only
     the main thread receives signals.

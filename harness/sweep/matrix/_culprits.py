@@ -1,10 +1,10 @@
 """Find the commits that made a numeric result worse. The search plays one run with the code of commits between the
 earlier night and this night.
 
-A run in virtual time is always the same, so one run is enough: the run whose result changed most. A binary search finds
-the first commit with a different result. If a later commit changed the result again, the search continues after the
-found commit. The search therefore also finds commits that change the result without making it worse. Each found commit
-is named with the result after it.
+A run in virtual time is always the same, so one run is enough. The search uses the run whose result became worse by the
+largest amount. A binary search finds the first commit with a different result. If a later commit changed the result
+again, the search continues after the found commit. The search therefore also finds commits that change the result
+without making it worse. For each found commit, the output contains the result before and after the commit.
 """
 
 import time

@@ -52,7 +52,7 @@ PANELS = (
     GrowthPanel("Runs with one uniform chain", "uniform"),
 )
 ALSO_OVER_BLOCKS = ("messages", "bytes")
-"""Metrics that get a second chart with the number of blocks on its horizontal axis. This needs a matrix with three
+"""Metrics with a second chart, whose horizontal axis shows the number of blocks. This chart needs a matrix with three
 numbers of agents and three mission lengths.
 """
 

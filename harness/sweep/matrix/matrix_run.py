@@ -2,9 +2,10 @@
 
 If the time is not sufficient for all runs, the module chooses their order. A cell is a combination of values in the
 matrix. A further run is most useful in the cell whose results are least certain. First, every cell gets two runs. After
-that, the next run belongs to the cell with the widest confidence interval. The module considers two confidence
-intervals: that of the share of runs with one chain, and that of the number of messages per block, divided by its mean.
-Cells with similar runs therefore get few runs, and cells with different runs get most of the time.
+that, the next run belongs to the cell with the widest confidence interval. The module considers the confidence
+intervals of two results: the share of runs with one chain, and the number of messages per block. The interval of the
+number of messages is divided by the mean number. Cells with similar runs therefore get few runs, and cells with
+different runs get most of the time.
 """
 
 import time

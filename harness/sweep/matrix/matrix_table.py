@@ -22,8 +22,8 @@ from harness.sweep.matrix._matrix_file import Matrix, MatrixPoint
 from harness.sweep.matrix.matrix_record import MatrixCoverage, MatrixRecord
 
 NAMED = 5
-"""Maximum number of seeds that the table lists for a cell. The table only counts the other runs. matrix.json contains
-all seeds.
+"""Maximum number of seeds that the table lists for a cell. For further seeds, the table gives only their number.
+matrix.json contains all seeds.
 """
 
 

@@ -104,8 +104,8 @@ def _shape(key: str, judgement: Judgement, result: Result, cycle: Cycle | None) 
 
 
 def _form(cycle: Cycle) -> list[str]:
-    """Return the sequences of timers that agents repeat in an endless cycle, each once. The command `prove` uses the
-    same form to compare livelocks.
+    """Return the sequences of timers that agents repeat in an endless cycle, without duplicates. The command `prove`
+    uses the same form to compare livelocks.
     """
     patterns = defaultdict[int, list[str]](list)
     for step in cycle.steps:

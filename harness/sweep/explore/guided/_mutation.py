@@ -310,8 +310,8 @@ def _change_duplication(document: Document, rng: Random) -> Document:
 
 
 def _change_clock(document: Document, rng: Random) -> Document:
-    """Set the clock of an agent to a different time than the other clocks. The blocks of this agent then seem older or
-    younger than they are.
+    """Set the clock of an agent to a different time than the other clocks, so that the blocks of this agent seem older
+    or younger than they are.
     """
     clocks = dict(document.get("clocks", {}))
     agent = str(rng.choice(document["agents"]))
