@@ -1,8 +1,8 @@
 """An implementation of the Uniform Chain Protocol: blocks, chain, messages, and the 20 event handlers of Algorithms
 1-20.
 
-`__all__` lists the public names. Python imports a public name only when a program first uses it. Every agent process
-imports this package, and it therefore starts faster.
+`__all__` lists the public names. Python imports a public name only when a program first uses it. An agent process
+therefore imports only the modules that it needs, and starts faster.
 """
 
 from typing import TYPE_CHECKING

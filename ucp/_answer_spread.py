@@ -54,7 +54,7 @@ class WaitingAnswers:
     def exchange(self, outbox: list[Outgoing], now: float) -> list[Outgoing]:
         """Add the answers in `outbox` to the waiting answers. Return all messages to send now, in order.
 
-        Answers whose waiting time is over come before the other messages in `outbox`.
+        Answers that are due come first. The messages in `outbox` that are not answers follow.
         """
         others = []
         for outgoing in outbox:

@@ -32,8 +32,9 @@ class DropQuota:
         self._counts: Counter[str] = Counter()
 
     def lines(self, entry: DroppedDatagram) -> Iterator[DroppedDatagram]:
-        """Yield the trace entries to write now, after a datagram was dropped. `entry` is the entry of this datagram. It
-        is among the result if it is within the quota. Otherwise it is counted. The counts follow if they are due.
+        """Yield the trace entries to write now, after a datagram was dropped. `entry` describes this datagram. If
+        `entry` is within the quota, yield it. Otherwise, only count the datagram. If counts are due, yield them at the
+        end.
         """
         self._left_bytes = min(QUOTA_BYTES, self._left_bytes + (entry.t - self._at_s) * BYTES_PER_S)
         self._at_s = entry.t
@@ -47,8 +48,8 @@ class DropQuota:
             yield from self.counts(entry.t)
 
     def counts(self, t: float) -> Iterator[DroppedDatagram]:
-        """Yield one entry per reason for a drop. The entry contains the number of datagrams that were dropped for this
-        reason since the previous count, and that the trace does not contain.
+        """Yield one entry for each reason for a drop. The entry contains the number of datagrams that were dropped for
+        this reason since the previous count and have no entry of their own.
         """
         self._counted_at_s = t
         for reason, count in self._counts.items():

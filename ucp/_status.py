@@ -1,12 +1,10 @@
-"""The status of an agent, as its driver reports it (see contract/CONTRACT.md)."""
+"""Compute the part of an agent's status that follows from its protocol state (see contract/CONTRACT.md)."""
 
 from ucp.agent import Agent
 
 
 def status_of(agent: Agent) -> dict[str, object]:
-    """Return the values of the status that follow from the protocol state of the agent. The caller adds all other
-    values.
-    """
+    """Return the values of the status that follow from the agent's protocol state. The caller adds the other values."""
     state = agent.state
     return {
         "agent_id": agent.agent_id,

@@ -14,10 +14,11 @@ For 10 seconds all other agents vote: an agent approves if its own chain has the
 the votes, the agent commits the block and broadcasts it, and agents with the same chain commit it too. Without a
 majority, the chains have diverged, and the agent starts a reconcile.
 
-Reconcile: the agent pops blocks from its chain onto a stack until the majority of the answering agents have its chain
-in theirs (phase 1). It asks for the successors in the majority's chain and commits them one by one (phases 2 and 3).
-Then it commits the rest of the stack again and broadcasts it (finalize). An agent that is asked for the successor of a
-chain hash that it does not have has diverged, and starts a reconcile too. An agent that reconciles answers no message.
+Reconcile: the agent pops blocks from its chain onto a stack. It stops when the chains of the majority of the answering
+agents contain all remaining blocks (phase 1). It asks for the successors in the majority's chain and commits them one
+by one (phases 2 and 3). Then it commits the rest of the stack again and broadcasts it (finalize). An agent that is
+asked for the successor of a chain hash that it does not have has diverged, and starts a reconcile too. An agent that
+reconciles answers no message.
 
 An agent has two interfaces. Its handlers use `ucp.core.Core`: the protocol state and its operations. The caller uses
 `Agent`, and may read the state as `agent.state`.
@@ -253,7 +254,9 @@ class Agent:
         self.release_answers(now)
 
     def release_answers(self, now: float) -> None:
-        """Make `datagrams_to_send` return also the delayed answers whose time to send is at most `now`."""
+        """Set the time to `now`. The next call of `datagrams_to_send` then also returns the delayed answers that are
+        due at this time.
+        """
         if self._waiting_answers is not None:
             self._core.now = now
 
@@ -390,8 +393,9 @@ def drop_reason(agent_id: int, roster: Container[int], sender: int, message: Mes
 
 
 def tally_of(core: Core, handler: EventHandler[Any]) -> Tally | None:
-    """Return the counters that the trace records for a run of this handler. They are the handler's counts of votes, or
-    the count of the block that it chose. Return None if the handler has no counters.
+    """Return the counters that the trace records for a run of this handler. If the handler counts votes or answers, the
+    result contains all counts. If it chooses a block, the result contains only the count of this block. Return None if
+    the handler has no counters.
     """
     if handler.tally is None:
         return None

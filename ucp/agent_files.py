@@ -41,9 +41,8 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class ReservedSpace:
-    """Disk space that is reserved for the chain export, so that no other file takes it.
-
-    A file without a name takes the space. The operating system frees this space when the process ends.
+    """Disk space that is reserved for the chain export, so that no other file can use it. A file without a name
+    occupies this space. The operating system frees the space when the process ends.
     """
 
     def __init__(self, directory: Path) -> None:

@@ -20,7 +20,9 @@ class MissionClock:
         return self.epoch_us is not None
 
     def start(self, epoch_us: int) -> None:
-        """Set mission time 0 to `epoch_us`, in microseconds since the Unix epoch, in the past or the future."""
+        """Set the wall time at which mission time is 0. `epoch_us` is this time in microseconds since the Unix epoch.
+        It may be in the past or in the future.
+        """
         self.epoch_us = epoch_us
         self._started = time.monotonic() - (time.time() - epoch_us / MICROSECONDS)
 

@@ -26,8 +26,8 @@ from ucp.settings import Settings
 from ucp.state import AgentState
 
 Question = tuple[type[Message], bytes]
-"""An open query of an agent. It consists of the type of the expected answers, and the hash of the block or chain that
-they concern.
+"""An open query of an agent: the type of the expected answers, and the hash of the block or chain that the query
+concerns.
 
 An agent can have two open queries: one of its vote (type Block Add Response), and one of its reconcile.
 """
@@ -46,8 +46,8 @@ ASKED: dict[type[Message], Callable[[Any, Settings], Question]] = {
     ChainHashSuccessorQuery: lambda message, settings: (NextInSequenceResponse, message.chain_hash),
     RequestForBlock: lambda message, settings: (BlockResponse, message.block_hash),
 }
-"""Type of a query -> function that returns the query as a `Question`. From now on, its sender waits for answers to it.
-Messages of other types are no queries.
+"""Type of a query -> function that returns the query as a `Question`. The sender of the query then waits for answers to
+this `Question`. Messages of other types are no queries.
 """
 
 ANSWERED: dict[type[Message], Callable[[Any], Question]] = {

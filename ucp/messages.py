@@ -7,8 +7,8 @@ Every datagram is broadcast and begins with one header, big-endian:
 The sender's sequence number identifies a datagram in traces and captures. The protocol does not use it. A datagram that
 is not exactly one well-formed message raises MalformedDatagramError.
 
-WIRE of a message declares its fields in their order. The layers of `ucp.scapy` are made from it. `body` and `from_body`
-are written by hand for speed, and tests compare them with WIRE.
+The attribute WIRE of a message class declares the fields of the message in their order. `ucp.scapy` makes its layers
+from these declarations. `body` and `from_body` are written by hand for speed, and tests compare them with WIRE.
 
 Treat messages as immutable. They are not frozen, because creating a frozen object takes three times as long.
 """

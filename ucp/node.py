@@ -136,7 +136,7 @@ class Node:
         return status
 
     def _log_exception(self, error: Exception) -> None:
-        """Log an exception of a handler and continue. An agent that ended would affect the other agents."""
+        """Log an exception of a handler. The agent then continues, because its end would affect the other agents."""
         import traceback
 
         self._log_line("".join(traceback.format_exception(error)).rstrip())
@@ -193,9 +193,9 @@ class Node:
     def _feed(self, feed: Callable[[float], None]) -> None:
         """Give the agent one input. Then write its records, broadcast its messages, and set its next timer.
 
-        The node writes store and trace before it broadcasts, because the process can be killed between these steps. A
-        dropped datagram changes neither the store nor a timer, and any sender can cause many of them. These steps are
-        therefore skipped for dropped datagrams.
+        The node writes store and trace before it broadcasts, because the process can be killed between these steps. For
+        a dropped datagram, the node only writes the trace, because the datagram changes neither the store nor a timer.
+        This saves time if a sender causes many drops.
         """
         feed(self.clock.now())
         entries, datagrams = self.agent.trace(), self.agent.datagrams_to_send()

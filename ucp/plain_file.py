@@ -63,8 +63,8 @@ def read_text(path: Path, most_bytes: int) -> str:
 
 
 def check_weight(text: str | bytes, most: int = MAX_JSON_WEIGHT) -> None:
-    """Raise ValueError if the weight of a JSON text is above `most`. Commas and brackets inside strings count as
-    well.
+    """Raise ValueError if the weight of a JSON text (see MAX_JSON_WEIGHT) is above `most`. Commas and brackets inside
+    strings count as well.
     """
     if isinstance(text, str):
         weight = text.count(",") + 4 * (text.count("[") + text.count("{"))

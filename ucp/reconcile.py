@@ -1,8 +1,9 @@
 """Reconcile a chain with those of the neighbours: Algorithms 7-20 (Section 3.6.3).
 
-Phase 1 pops blocks onto the reconcile stack until the majority of agents contains the rest of the chain. Phases 2 and 3
-ask for the successors in the majority's chain, block by block, and commit them. Finalize commits the rest of the stack
-again, and broadcasts each block. While `reconcile_in_progress` is set, the agent answers no message.
+Phase 1 pops blocks onto the reconcile stack until the chains of the majority of the answering agents contain all
+remaining blocks. Phases 2 and 3 ask for the successors in the majority's chain, block by block, and commit them.
+Finalize commits the rest of the stack again, and broadcasts each block. While `reconcile_in_progress` is set, the agent
+answers no message.
 """
 
 from collections.abc import Mapping, Sequence
@@ -177,9 +178,9 @@ def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
 
 
 def without_minority_top(candidates: Mapping[bytes, Sequence[int]]) -> Mapping[bytes, Sequence[int]]:
-    """Return the candidates of phase 2. Omit "Is Top Of Chain" if the agents that named it are not a majority. This
-    agent counts itself among them. The agents that named a block would disapprove the next proposal of this agent
-    (Algorithms 3 and 5).
+    """Return the candidates of phase 2. Omit "Is Top Of Chain" unless this agent and the agents that named it together
+    are a majority. Without this majority, the agents that named a block would disapprove the next proposal of this
+    agent (Algorithms 3 and 5).
     """
     with_us = 1 + candidates.get(IS_TOP_OF_CHAIN, (0,))[0]
     blocks = {candidate: counted for candidate, counted in candidates.items() if candidate != IS_TOP_OF_CHAIN}

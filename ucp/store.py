@@ -1,10 +1,10 @@
 """Store the data of an agent on the disk of its vehicle, so that it can continue after a power failure.
 
 The store is a journal. An entry is a line: the CRC-32 of the rest in eight hexadecimal digits, a space, and JSON. The
-first entry identifies the agent. Each other entry has the changes by one input, as in a trace, and the new blocks. The
-agent writes an entry before other agents can observe the changes. Each entry has all changes by one input. The entries
-from the first to any later line therefore describe a state that the agent had. A reader stops at the first damaged
-line.
+first entry identifies the agent. Each other entry contains all changes that one input caused, as in a trace, and the
+new blocks. The agent writes an entry before other agents can observe the changes. Because no entry contains only a part
+of an input's changes, the entries from the first to any later line describe a state that the agent had. A reader stops
+at the first damaged line.
 
 An agent that boots writes a new journal with the recovered data, and replaces the old journal when the new one is on
 disk. A valid journal therefore exists at any time.
@@ -108,7 +108,7 @@ class StoredState:
             raise ValueError("a block is stored twice, or a completed block is missing")
 
     def _change(self, operation: str, block: Block) -> None:
-        """Apply one change, an operation with a block."""
+        """Apply one change of the state. A change is an operation on a block, such as "chain+"."""
         match operation:
             case "complete":
                 self.completed.append(block.block_hash)
@@ -126,8 +126,8 @@ class StoredState:
                 self.stack.remove(block)
 
     def replay(self, entry: dict[str, Any], known: dict[str, Block]) -> None:
-        """Apply all changes in one entry of the store file. Add its blocks to `known`, which maps the hashes of all
-        blocks so far to the blocks.
+        """Apply all changes in one entry of the store file. Add the blocks in the entry to `known`, which maps block
+        hashes to the blocks of all entries so far.
         """
         for agent_id, timestamp_us, event_data in entry["blocks"]:
             block = block_on_disk(agent_id, timestamp_us, base64.b64decode(event_data))

@@ -1,8 +1,8 @@
 """The trace of an agent. It has a line of JSON for each handler run, and for each input that runs no handler.
 
-A trace contains all inputs completely, so the run of the agent can be repeated from its trace. Only dropped datagrams
-above a quota are counted instead (`ucp._drop_quota`). `changes` lists all changes of a step. A reader that applies the
-changes knows the contents of chain, deque and reconcile stack after each step.
+A trace contains all inputs completely, so the run of the agent can be repeated from its trace. The only exceptions are
+dropped datagrams above a quota, which are only counted (`ucp._drop_quota`). `changes` lists all changes of a step. A
+reader that applies the changes knows the contents of chain, deque and reconcile stack after each step.
 
 In a line, datagrams, events and stores are encoded in base64. In memory they are encoded only when their text is
 needed.
@@ -30,8 +30,8 @@ class Encodable(Protocol):
 
 
 class RecordedBytes:
-    """Recorded bytes. `text` is their base64 form. `content` is the decoded object. It is None if the bytes were read
-    from a file.
+    """Recorded bytes. `text` is their base64 form. `content` is the decoded object, or None if the bytes were read from
+    a file.
 
     Sender and receivers of a datagram share one object.
     """

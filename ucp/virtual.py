@@ -65,7 +65,7 @@ def serve(lines: BinaryIO, answers: BinaryIO) -> None:
 
 
 class VirtualAgent:
-    """An agent in virtual time, from its start to its end. Its first input is a line with the keys `t`, `mission`,
+    """An agent in virtual time, from its start to its end. The first input is a line with the keys `t`, `mission`,
     `trace` and `store`. Raises InputError.
     """
 
@@ -260,7 +260,9 @@ _COMMANDS: dict[str, Callable[[VirtualAgent, dict[str, Any], float], dict[str, A
 
 
 def _agent_factory(mission: Mission, given: dict[str, Any]) -> Callable[..., Agent]:
-    """Return a function that creates the agent of the mission. Its arguments are those of Agent. Raises InputError."""
+    """Return a function that creates the agent of the mission. The function has the arguments of `Agent`. Raises
+    InputError.
+    """
     if mission.security is None:
         return Agent
     try:

@@ -40,9 +40,9 @@ CRASHED = "crashed by quirk"
 class Quirk:
     """A deliberate error. `wrong` replaces the handlers of `algorithms`, or the operation `helper` in these handlers.
 
-    `branches`, `sends`, `starts` and `triggers` list the branches, messages, timers and events of the wrong handlers
-    that the good handlers lack. If `chance` is true, the value of the quirk is a probability 0..1, and `wrong` receives
-    a function that draws whether the mistake occurs. Otherwise the value is true or false.
+    `branches`, `sends`, `starts` and `triggers` list the branches, messages, timers and events that the wrong handlers
+    use, but the good handlers do not use. If `chance` is true, the value of the quirk is a probability 0..1, and
+    `wrong` receives a function that draws whether the mistake occurs. Otherwise the value is true or false.
     """
 
     name: str

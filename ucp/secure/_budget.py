@@ -3,13 +3,15 @@
 Two steps of opening a datagram are expensive. A budget limits their number: it holds some tokens, and each step takes
 one. If no token is left, the agent drops the datagram before the step.
 
-- *Wrong signatures.* Each takes more than 100 us. An attacker without keys cannot make an agent verify a signature,
-  because the authenticated encryption covers it. An attacker with the keys of one vehicle can. Each sender has a budget
-  of its own, so that forgeries in its name do not affect the datagrams of other senders.
-- *Keys of an unknown boot.* To derive these keys takes longer than all other steps for a datagram with a wrong tag. An
-  attacker without keys can invent any number of boots. All senders share one budget. If each sender had a smaller
-  budget of its own, an attacker could exhaust the budget of one sender with fewer datagrams, because the attacker also
-  chooses the sender. The accepted boots of all senders need no token, because the agent keeps their keys.
+- *Wrong signatures.* The verification of a signature takes more than 100 us. An attacker without keys cannot make an
+  agent verify a signature, because the authenticated encryption covers the signature. An attacker with the keys of one
+  vehicle can do this in the name of any sender. Each sender therefore has a budget of its own, so that such forgeries
+  do not affect the datagrams of other senders.
+- *Keys of an unknown boot.* The derivation of these keys takes longer than all other steps for a datagram with a wrong
+  tag. An attacker without keys can invent any number of boots (starts of a sender). All senders share one budget. If
+  each sender had a smaller budget of its own, an attacker could exhaust the budget of one sender with fewer datagrams,
+  because the attacker also chooses the sender. The accepted boots of all senders need no token, because the agent keeps
+  their keys.
 """
 
 import math

@@ -1,11 +1,11 @@
-"""Challenge messages. With them a receiver makes a sender prove that the sender is active now (compare Echo in RFC
+"""Challenge messages. A receiver sends a challenge to find out whether a sender is active now (compare Echo in RFC
 9175).
 
 A vehicle that boots during a mission has missed earlier datagrams. Its replay windows are therefore incomplete, and it
 cannot distinguish a new datagram from a recorded one. It broadcasts a *challenge*. Each other vehicle answers with an
-*echo*. An echo names the challenge, and the next sequence number that the sender of the echo will use. The sender signs
-the echo, and an attacker cannot have recorded the echo before the challenge. After the echo, the receiver accepts
-datagrams of this sender from this sequence number on.
+*echo*. An echo names the challenge, and the next sequence number that the sender of the echo will use. An echo proves
+that its sender is active, because the sender signs the echo, and an attacker cannot have recorded the echo before the
+challenge. After the echo, the receiver accepts datagrams of this sender from this sequence number on.
 
 A receiver also challenges a sender whose boot is older than the known one. The boot may be recorded, or the sender may
 have lost its clock and its disk.
@@ -31,19 +31,19 @@ ALL = 0
 
 
 class PendingChallenges:
-    """The challenges of one vehicle since its last start, to which it waits for echoes. The target of a challenge is an
-    agent ID or `ALL`.
+    """The challenges that one vehicle has sent since its last start, and whose echoes it still accepts. The target of a
+    challenge is an agent ID or `ALL`.
     """
 
     def __init__(self) -> None:
         self.first_at: float | None = None
-        """The mission second of the first challenge to all vehicles. None before it."""
+        """The mission second of the first challenge to all vehicles. None before this challenge."""
         self._due: set[int] = set()
         self._sent_at: dict[int, float] = {}
         self._pending: dict[int, int] = {}
-        """Agent to which a challenge was sent -> sequence number of the newest challenge to this agent."""
+        """Target -> sequence number of the newest challenge that was sent to this target."""
         self._closed: dict[int, int] = {}
-        """Sender -> smallest sequence number of a challenge to which its echoes still count."""
+        """Sender -> smallest sequence number of a challenge to which an echo of this sender still counts."""
 
     @property
     def is_due(self) -> bool:
@@ -68,12 +68,14 @@ class PendingChallenges:
         self._pending[target] = sequence
 
     def is_pending(self, sequence: int, sender: int) -> bool:
-        """Return whether this sequence number belongs to the newest challenge to this sender or to all vehicles."""
+        """Return whether this sequence number belongs to the newest challenge to this sender or to all vehicles, and an
+        echo of this sender to this challenge still counts.
+        """
         is_newest = sequence in (self._pending.get(ALL), self._pending.get(sender))
         return is_newest and sequence >= self._closed.get(sender, 0)
 
     def close(self, sender: int, next_sequence: int) -> None:
-        """Ignore further echoes of this sender to challenges with a lower sequence number than this one."""
+        """Ignore further echoes of this sender to challenges with a sequence number below `next_sequence`."""
         self._closed[sender] = next_sequence
 
 
@@ -88,7 +90,9 @@ class ReceivedChallenges:
         return sequence > self._newest.get(boot, -1)
 
     def add(self, boot: bytes, sequence: int) -> None:
-        """Record a challenge as received. Forget the boot that was added first if there are too many."""
+        """Record a challenge as received. If more than MAX_REMEMBERED_BOOTS boots are recorded, forget the boot that
+        was added first.
+        """
         self._newest[boot] = sequence
         if len(self._newest) > MAX_REMEMBERED_BOOTS:
             del self._newest[next(iter(self._newest))]

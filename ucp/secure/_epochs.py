@@ -6,13 +6,15 @@ secrets. An attacker who captures the vehicle therefore cannot decrypt older dat
 
 The clocks of the vehicles need not agree, and the clock of a vehicle may be lost after a reboot:
 
-- Only the vehicle's own clock erases secrets. The epoch of a clock that was set back is wrong. The vehicle therefore
-  never uses an epoch before the epoch of its bundle plus the number of epochs since its start.
+- Only the vehicle's own clock erases secrets. If the clock was set back, it shows a wrong epoch. The vehicle therefore
+  also counts the epochs since its start, beginning with the epoch of its bundle, and never uses an epoch before the
+  counted one.
 - A vehicle opens datagrams of any epoch up to `MAX_EPOCHS_AHEAD` epochs after its clock's epoch. Such datagrams do not
   change its clock.
-- A vehicle sends in the latest epoch that it has received, so that vehicles with a faster clock can open its datagrams.
-  It is never more than `MAX_EPOCHS_FOLLOWED` epochs ahead of its own clock. An attacker with the keys of one vehicle
-  can therefore make other vehicles send in a later epoch, but all vehicles can still open their datagrams.
+- A vehicle sends in the latest epoch in which it has received a datagram, so that vehicles with a faster clock can open
+  its datagrams. This epoch is never more than `MAX_EPOCHS_FOLLOWED` epochs ahead of the vehicle's own clock. An
+  attacker with the keys of one vehicle can therefore make other vehicles send in a later epoch, but all vehicles can
+  still open their datagrams.
 """
 
 import math
@@ -91,8 +93,8 @@ class EpochSecrets:
         return 0 <= later <= MAX_EPOCHS_AHEAD or (later == -1 and self._previous_secret is not None)
 
     def follow(self, epoch: int) -> None:
-        """Send datagrams at least in this epoch from now on, because another vehicle with the group secret sends in it.
-        The limit is `MAX_EPOCHS_FOLLOWED` epochs ahead of the own clock.
+        """Send all further datagrams in this epoch or a later one, because another vehicle with the group secret sends
+        in this epoch. The vehicle follows at most to `MAX_EPOCHS_FOLLOWED` epochs after the epoch of its own clock.
         """
         self._followed = max(self._followed, min(epoch, self._bundle.epoch + MAX_EPOCHS_FOLLOWED))
 
@@ -114,13 +116,15 @@ class EpochSecrets:
         return abs(epoch - self._bundle.epoch) <= 1 or abs(epoch - self.current) <= 1
 
     def cached_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys | None:
-        """Return the cached keys with which this sender encrypts since its start `boot`. Return None if no keys are
-        cached.
+        """Return the cached keys with which this sender, since its start `boot`, encrypts datagrams in this epoch.
+        Return None if no keys are cached.
         """
         return self._sender_keys.get((epoch, sender, boot))
 
     def derive_keys(self, epoch: int, sender: int, boot: bytes) -> SenderKeys:
-        """Derive the keys with which this sender encrypts since its start `boot`. `can_open(epoch)` must be true."""
+        """Derive the keys with which this sender, since its start `boot`, encrypts datagrams in this epoch.
+        `can_open(epoch)` must be true.
+        """
         return self._derive_keys(self._secret(epoch), self._mission, epoch, sender, boot)
 
     def remember(self, epoch: int, sender: int, boot: bytes, keys: SenderKeys) -> None:

@@ -1,4 +1,4 @@
-"""Keep the memory of a process with keys out of core dumps."""
+"""Prevent core dumps of a process that has keys, because a core dump would contain the keys."""
 
 import ctypes
 import resource
@@ -7,8 +7,8 @@ _PR_SET_DUMPABLE = 4
 
 
 def forbid_core_dumps() -> None:
-    """Let the kernel write no core dump of this process, neither to a file nor to a program, and deny access to its
-    memory to other programs of the user.
+    """Prevent core dumps of this process to a file or to a program. Also prevent other programs of the user from
+    accessing the memory of this process.
 
     Programs that the process starts can write only empty core dumps.
     """

@@ -25,10 +25,9 @@ from ucp.secure.session import Session
 def agent_factory(
     mission: Mission, directory: Path, report_write_error: Callable[[OSError], None]
 ) -> Callable[..., SecuredAgent]:
-    """Return a function that creates the agent of a mission. Its arguments are those of Agent.
-
-    `directory` is the directory of the mission file. `report_write_error` is called if a bundle without old secrets
-    cannot be written to disk. Raises MissionError.
+    """Return a function that creates the agent of a mission. The function has the arguments of `Agent`. `directory` is
+    the directory of the mission file. `report_write_error` is called if a bundle without old secrets cannot be written
+    to disk. Raises MissionError.
     """
     assert mission.security is not None, "the mission is secured"
     forbid_core_dumps()

@@ -11,10 +11,8 @@ from ucp.state import AgentState
 
 
 class BlockSignatures:
-    """The signatures of blocks by the agents that completed them, by block hash.
-
-    A signature is verified once per block. The signature of a received block that the agent did not accept is
-    discarded.
+    """The signatures that accompany blocks. Each block is signed by the agent that completed the block, and its
+    signature is verified once. The signature of a received block that the agent did not accept is discarded.
     """
 
     def __init__(self, session: Session, state: AgentState) -> None:
@@ -38,9 +36,8 @@ class BlockSignatures:
         return self._by_hash
 
     def is_genuine(self, block: Block, signature: bytes) -> bool:
-        """Return whether the block has a valid signature of the agent that the block names. Keep a valid signature.
-
-        The agent must be on the roster.
+        """Return whether the agent that the block names has signed the block. If the signature is valid, keep it. The
+        agent must be on the roster.
         """
         if block.block_hash in self.held():
             return True

@@ -74,8 +74,8 @@ class ClearHeader(NamedTuple):
 
     @property
     def position(self) -> int:
-        """The number of the datagram from which its nonce follows. Messages and control datagrams have separate ranges
-        of numbers.
+        """The number from which the nonce of this datagram is computed. Messages and control datagrams have separate
+        ranges of numbers.
         """
         return self.sequence if self.type < REVOCATION else CONTROL_POSITION + self.sequence
 

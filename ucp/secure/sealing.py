@@ -2,8 +2,8 @@
 attackers that capture a vehicle.
 
 Sealing is HPKE (RFC 9180) in base mode: DHKEM(X25519, HKDF-SHA256), HKDF-SHA256, ChaCha20-Poly1305, and one message per
-key. `info` contains mission, agent and timestamp, so sealed data of one block is not valid in another block.
-Additional data (AAD) would bind them as well, but some HPKE libraries do not support it.
+key. `info` contains mission, agent and timestamp, so sealed data of one block is not valid in another block. Additional
+data (AAD) could contain these values instead, but some HPKE libraries do not support AAD.
 
 A vehicle draws a random ephemeral key for each block. If the key followed from the vehicle's private key and the
 events, the holder of the private key could guess the events of a block, and confirm each guess. In virtual time, equal

@@ -45,19 +45,19 @@ from ucp.secure.sealed_datagrams import (
 )
 
 WRONG_SIGNATURES_PER_S = 1000.0
-"""Maximum number of wrong signatures of all senders that a receiver verifies per mission second. The verification takes
-a tenth of a processor core.
+"""Maximum number of wrong signatures that a receiver verifies per mission second. The senders share this number
+equally. The verification takes a tenth of a processor core.
 """
 REVOCATIONS_PER_S = 50.0
 """Maximum number of wrong signatures of the authority that a receiver verifies per mission second."""
 WRONG_SIGNATURES_AT_ONCE = 32
-"""Maximum number of wrong signatures in one sender's name that a receiver verifies in a row."""
+"""Maximum number of wrong signatures in one sender's name that a receiver verifies immediately one after another."""
 UNKNOWN_BOOTS_PER_S = 5000.0
 """Maximum number of datagrams per mission second from unknown starts (boots) of senders for which a receiver derives
 keys. A radio with 6 Mbit/s carries fewer datagrams. The derivation takes a twentieth of a processor core.
 """
 UNKNOWN_BOOTS_AT_ONCE = 1000
-"""Maximum number of keys for unknown starts (boots) that a receiver derives in a row."""
+"""Maximum number of keys for unknown starts (boots) that a receiver derives immediately one after another."""
 
 
 class _SenderIncarnation:
@@ -273,8 +273,8 @@ class Session:
     def receive_challenge(self, datagram: bytes, clear: ClearHeader, now: float) -> None:
         """Schedule an echo that answers a challenge. Raises MalformedDatagramError.
 
-        A challenge that is not newer than all known challenges of its boot may be a replay. The sender of a replayed
-        challenge does not wait for an answer.
+        The method drops a challenge that is not newer than all known challenges of its boot. Such a challenge may be a
+        replay, and the sender of the original challenge no longer waits for an answer.
         """
         if not self.epochs.can_open(clear.epoch):
             raise MalformedDatagramError("epoch out of range")

@@ -231,8 +231,7 @@ class TelemetryEvents:
 
 
 class _HomeError:
-    """The error in the height above home that a vehicle reports. It is computed from the first good position of the
-    vehicle.
+    """The error of the height above home in a vehicle's positions. The error is computed from the first good position.
 
     A rover of ArduPilot 4.7 sets its home before it knows its altitude, and afterwards reports a height of 584 m above
     home.

@@ -90,8 +90,8 @@ class SecuredStory(RecordedMission):
         return self._peers[sender].seal(sequence, message, request, signature, 0)
 
     def _message(self, datagram: bytes) -> Message | None:
-        """Return the message in a datagram of the agent, and store its identity for answers. Return None for a control
-        datagram, which contains no message.
+        """Return the message in a datagram of the agent. Store the identification of the datagram, which answers of
+        other agents must contain. Return None for a control datagram, which contains no message.
         """
         if datagram[3] in CONTROL_NAMES:
             return None

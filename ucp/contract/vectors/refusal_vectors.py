@@ -1,7 +1,8 @@
 """Test vectors for missions that an agent must accept or refuse, and for requests to its control socket.
 
-The missions are in virtual time, where an agent refuses a mission with an error. As a program it ends with status 2. If
-it lacks a feature that the mission needs, the error is `unsupported`, and the exit status is 127.
+The missions are in virtual time, where an agent refuses a mission with an error. Outside virtual time, the agent
+program would end with status 2. If the agent lacks a feature that the mission needs, the error is `unsupported`, and
+the exit status would be 127.
 """
 
 import json

@@ -52,7 +52,8 @@ NO_LOG_FILES = ["--ros-args", "--disable-external-lib-logs"]
 class RosLoop(Loop):
     """An event loop with the interface of `ucp.loop` on a ROS executor. One ROS timer is set to the next callback.
 
-    ROS cannot wait for sockets. A thread waits for them and wakes the executor, which calls back.
+    ROS cannot wait for sockets. A thread therefore waits for them, and wakes the executor, which then calls the
+    functions of the sockets.
     """
 
     def __init__(self, ros: RosNode) -> None:
