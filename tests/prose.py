@@ -4,8 +4,8 @@ The house style asks for short sentences with an actor, a verb and an object. Ea
 this rule. `tests/test_prose.py` compares the count of each file with `tests/prose_counts.txt`: a count may only go
 down. A file that is not listed must contain no pattern. A low count does not make a text readable; a reader does.
 
-`python -m tests.prose` prints each occurrence, and `python -m tests.prose FILE ...` prints those in some files. `python
--m tests.prose --record` lowers the recorded counts, and never raises one.
+`python -m tests.prose` prints each occurrence, and `python -m tests.prose FILE ...` prints the occurrences in these
+files. `python -m tests.prose --record` lowers the recorded counts, and never raises one.
 """
 
 import ast

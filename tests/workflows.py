@@ -1,9 +1,9 @@
-"""Play the jobs of a workflow of a build server in a directory, without the service.
+"""Run the jobs of a build server's workflow in a local directory, without the build server.
 
 The shell steps run with a clean environment. `PATH` contains the directories of the system, and a directory in which a
-test replaces programs that need a network or much time. Steps that use an action of the service are imitated if they
-move files, such as caches and artefacts, and skipped otherwise. The test fails if a workflow uses an unknown name or
-function in an expression.
+test replaces programs that need a network or much time. If a step uses an action of the build server that moves files,
+such as caches and artefacts, this module imitates the action. It skips all other actions. The test fails if a workflow
+uses an unknown name or function in an expression.
 """
 
 import os

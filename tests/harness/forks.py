@@ -1,9 +1,9 @@
 """Call `ucp-harness` without the time for its imports. A server process that has already imported all commands forks
 for each call.
 
-Each call is a process with its own arguments, working directory, environment and standard streams. A fork saves the
-import of the modules, 0.4 s of processor time. `python -m tests.harness.forks FD` is the server process. It ends when
-the other end of its socket is closed.
+Each call is a process with its own arguments, working directory, environment and standard streams. A fork needs no
+import of the modules, which saves 0.4 s of processor time. `python -m tests.harness.forks FD` is the server process. It
+ends when the other end of its socket is closed.
 """
 
 import atexit

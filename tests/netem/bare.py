@@ -1,4 +1,4 @@
-"""Open a virtual network, start programs in it that ignore signals, and wait.
+"""Open a virtual network, start programs that ignore signals in this network, and wait.
 
 `bare.py FOLDER [ENGINE]` prints each step on standard output.
 """

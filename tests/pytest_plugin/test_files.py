@@ -1,4 +1,4 @@
-"""Test scenarios that are collected as tests, and YAML files of other programs, which are not."""
+"""Test that the plugin collects scenarios as tests, and ignores YAML files of other programs."""
 
 import json
 import os

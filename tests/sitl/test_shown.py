@@ -1,4 +1,4 @@
-"""Test the computed flight path in the form in which a ground station receives it."""
+"""Test the simulated vehicle that shows a computed flight path to a ground station."""
 
 from typing import Any
 

@@ -1,5 +1,5 @@
-"""Fuzz target: an agent's answer on its control socket. The reader must accept it as a status, or refuse it in one
-sentence.
+"""Fuzz target: an agent's answer on its control socket. The reader must accept the answer as a status, or refuse the
+answer in one sentence.
 """
 
 import asyncio

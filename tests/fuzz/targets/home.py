@@ -1,8 +1,8 @@
 """Fuzz target: files of a real flight, and all code that reads them.
 
 The code raises no unexpected exception, and reports each unused file. The target ingests a file alone and together with
-undamaged files. It imports the file, replays the file if it is a trace, and reads it from the archive of its run. Only
-some inputs take the slow steps. The bytes of an input determine whether it takes them.
+undamaged files. It imports the file, replays the file if it is a trace, and reads it from the archive of its run. The
+target performs the slow steps only with some inputs. The bytes of an input determine this.
 """
 
 import zlib

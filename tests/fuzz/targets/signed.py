@@ -1,7 +1,7 @@
 """Fuzz target: the signed export of a secured run, or its public keys.
 
-The checker judges both without an unexpected exception. The first byte of the input selects the file that the rest of
-the input replaces.
+The checker judges both files without an unexpected exception. The first byte of the input selects a file. The other
+bytes replace the content of this file.
 """
 
 from collections.abc import Iterator

@@ -1,4 +1,5 @@
-"""Fuzz target: an agent in virtual time. Each input line gets one JSON line as its answer, which is the same each time.
+"""Fuzz target: an agent in virtual time. Each input line gets one JSON line as its answer. If the input is repeated,
+the answers are the same.
 
 The reference implementation takes the same steps, and the agent can restart from its stored data.
 """

@@ -1,4 +1,6 @@
-"""Test run.json: valid parts are used, invalid parts are reported, and the checker needs all its keys."""
+"""Test run.json: valid parts are used, invalid parts are reported, and the checker judges only a file that contains all
+keys.
+"""
 
 import json
 import shutil

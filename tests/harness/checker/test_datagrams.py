@@ -1,4 +1,5 @@
-"""Test that the kernel's counters reveal agents that discard datagrams without recording them, or read none.
+"""Test that the kernel's counters reveal agents that discard datagrams without recording them, and agents that stop
+reading datagrams.
 
 Test that the checker compares the log of a shared channel with the traces and run.json.
 """

@@ -1,4 +1,4 @@
-"""Test late timers: delays that the machine does not explain are deviations, and a slow machine accuses no agent.
+"""Test late timers: a delay that the slowness of the machine explains is no deviation, and any other delay is one.
 
 Test the lateness of vote timers with artificial traces.
 """

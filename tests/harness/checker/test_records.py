@@ -1,5 +1,5 @@
-"""Test the check of records: edited, cut or mixed records never get a good verdict, and unchanged ones contradict no
-other.
+"""Test the check of records: edited, cut or mixed records never get a good verdict, and unchanged records never
+contradict each other.
 """
 
 import base64

@@ -1,7 +1,6 @@
-"""Test that `check` compares its verdicts and versions with the stored ones. The status is 4 for a swarm that needs
-more time.
-
-Test the progress display while a run is judged. Ctrl-C ends it with a sentence and exit status 130.
+"""Test that `check` compares its verdicts and versions with the stored verdicts and versions. The exit status is 4 for
+a swarm that needs more time. Test the progress display while `check` judges a run. After Ctrl-C, `check` prints a
+sentence and ends with exit status 130.
 """
 
 import io

@@ -1,5 +1,5 @@
-"""Test the end of the record of an agent that died in a handler, and messages that an agent ignored without a
-record.
+"""Test records that end because an agent died in a handler. Test that messages are found that an agent ignored without
+recording them.
 """
 
 import dataclasses

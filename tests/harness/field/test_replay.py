@@ -1,4 +1,4 @@
-"""Test the replay of records: differences, exact steps back, and unusable records."""
+"""Test the replay of records: it finds differences, goes back to exact earlier states, and refuses unusable records."""
 
 import json
 import shutil

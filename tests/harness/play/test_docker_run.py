@@ -1,5 +1,5 @@
-"""Test the Docker backend with real containers: it has the same verdicts as processes, supports faults, and leaves
-nothing behind.
+"""Test the Docker backend with real containers: its runs get the same verdicts as runs with processes, may contain
+faults, and leave no containers or files behind.
 """
 
 import json

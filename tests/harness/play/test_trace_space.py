@@ -1,4 +1,6 @@
-"""Test traces that end at a quota: the record counts the missing lines, and no check reports that a property holds."""
+"""Test traces that end at a quota: the record states how many lines are missing, and the checker does not report that a
+property holds.
+"""
 
 import json
 from pathlib import Path

@@ -1,5 +1,5 @@
-"""Test that two states count as one state if they differ only in the identity of blocks, and if any block may be the
-oldest.
+"""Test the option `--clocks any`, with which any block may be the older one. States that differ only in the identity of
+blocks then count as one state.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,6 @@
-"""Test protocol variants: agents follow them, the checker compares with them, and records name them."""
+"""Test protocol variants: agents follow a variant, the checker judges the agents by the variant, and records name the
+variant.
+"""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Test how secured runs end: after no signal does a file contain a secret."""
+"""Test the ends of secured runs: no file contains a secret afterwards, whatever signal ended the run."""
 
 import json
 import os

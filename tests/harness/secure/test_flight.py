@@ -1,5 +1,5 @@
-"""Test every command that reads runs with a secured flight. The flight has encrypted events, packet captures and an
-excluded vehicle.
+"""Play a secured flight. Test every command that reads runs on the records of this flight. The flight has encrypted
+events, packet captures and an excluded vehicle.
 
 Each command prints correct results with and without keys, and never a secret.
 """

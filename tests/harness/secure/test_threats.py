@@ -1,4 +1,4 @@
-"""Test that each row of the table of attacks shows the result of the attack."""
+"""Play each attack in the table of attacks, and test that its row shows the result."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""Call the reference implementation in tests. Each method gives it one input and returns the resulting handler runs.
+"""Call the reference implementation in tests. Each method passes one input to the reference implementation, and returns
+the resulting handler runs.
 
 The functions bring an agent of the reference implementation into a state in which a test can call its handlers.
 The agent under test has ID 1. Agents 2 to 5 exist only as senders of messages.

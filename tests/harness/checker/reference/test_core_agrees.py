@@ -1,6 +1,7 @@
 """Test that the agent and the independent reference take the same steps in the same state, for random inputs.
 
-`prove` compares them in every state within bounds. Here both get random inputs in random states outside any bounds.
+`prove` compares them in every state within bounds. These tests instead use random inputs in random states, which may be
+outside the bounds.
 """
 
 from dataclasses import replace

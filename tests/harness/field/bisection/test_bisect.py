@@ -1,4 +1,4 @@
-"""Test the search for commits: it finds the commit that breaks a handler, and leaves no temporary files."""
+"""Test the search in the commit history: it finds the commit that breaks a handler, and leaves no temporary files."""
 
 import json
 import os

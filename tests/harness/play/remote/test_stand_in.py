@@ -1,4 +1,4 @@
-"""Test the stand-in of a remote agent without a lab. The test plays the harness and the far computer."""
+"""Test the stand-in of a remote agent without a lab. The test acts as the harness and as the far computer."""
 
 import asyncio
 import json

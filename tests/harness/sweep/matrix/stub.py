@@ -1,4 +1,6 @@
-"""Judge runs without a simulation. The numeric results of a run follow from its loss rate and its seed."""
+"""Return results of runs for tests of a matrix, without a simulation. The numeric results of a run are computed from
+its loss rate and its seed.
+"""
 
 import tempfile
 from collections.abc import Callable

@@ -1,5 +1,5 @@
-"""Test the causes of a changed night: the first changed handler run of each changed run, and the commits of a worse
-figure.
+"""Test the causes of a changed night: the first changed handler run of each changed run, and the commits that made a
+figure worse.
 """
 
 import json

@@ -1,8 +1,8 @@
 """Create traces of the agent core for inputs that lead to rare branches. Random inputs and small bounds hardly reach
 these branches.
 
-Each function plays one short story of agent 1, and starts with a new agent. The stories take blocks from the reconcile
-stack, hold ties in phase 2, and give an agent answers that no correct agent sends.
+Each function plays one short story of agent 1, and starts with a new agent. In the stories, the agent takes blocks from
+the reconcile stack, meets ties in phase 2, and receives answers that no correct agent sends.
 """
 
 from collections.abc import Callable

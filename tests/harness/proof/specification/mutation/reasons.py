@@ -1,4 +1,6 @@
-"""Check with TLC that the specification satisfies the reasons for which some edits change no behaviour."""
+"""Some edits of the specification change no behaviour, because the specification has certain invariants. Check these
+invariants with TLC.
+"""
 
 from collections.abc import Mapping, Sequence
 
