@@ -226,7 +226,7 @@ class RunArchive:
 
     @cached_property
     def large(self) -> bool:
-        """True if all traces together are larger than LARGE_BYTES."""
+        """True if all traces together are larger than LARGE_BYTES, or if any trace is packed."""
         files = [path for path in self._trace_files if path.is_file()]
         return any(map(is_packed, files)) or sum(path.stat().st_size for path in files) > LARGE_BYTES
 
@@ -409,7 +409,7 @@ class RunArchive:
 
 
 def _early_end(trace: Trace, recorded: AgentRecord) -> str:
-    """Return a sentence about a trace that ends early because its agent could not write all of it."""
+    """Return a sentence about a trace that ends early because the agent could not write the rest."""
     why = f"it ends early: {recorded.trace_problem}"
     counted = [life.counted if life else None for life in recorded.handler_runs]
     if not trace.runs or None in counted:

@@ -238,8 +238,8 @@ class _LimitedContent(io.RawIOBase):
         return self._unpacked(most) if self.packed else self._read(most)
 
     def _read(self, most: int) -> bytes:
-        """Return up to `most` bytes of a file that is not gzip data. Packed parts, which the file contains as NUL
-        bytes, come from the gzip file if it has them.
+        """Return up to `most` bytes of a file that is not gzip data. In place of a packed part, the file contains NUL
+        bytes. The method returns the content of such a part from the gzip file, if the gzip file contains it.
         """
         begin = self._file.tell()
         data: bytes = self._file.read(most)
@@ -313,8 +313,8 @@ MAX_LINES_BYTES = 32 * 1024 * 1024
 """Maximum size of a JSON Lines file in bytes. The tracks of 50 vehicles take 1.6 MB for a mission of 20 minutes."""
 MAX_LINE_BYTES = 4 * 1024 * 1024
 MAX_LINE_WEIGHT = 200_000
-"""Maximum weight of a line, which measures the memory that its JSON values need (see `ucp.plain_file`). A line with the
-conditions of 10,000 links has half of this weight.
+"""Maximum weight of a line. The weight of a text is a measure of the memory that its JSON values need (see
+`ucp.plain_file`). A line with the conditions of 10,000 links has half of this weight.
 """
 
 Record = TypeVar("Record", bound=BaseModel)

@@ -145,7 +145,7 @@ class NetworkReplay:
         self._cut_off: set[Pair] = set()
         self._scripted: dict[Pair, tuple[float, float]] = {}
         """Pair of vehicles -> the losses that the scenario requests for the two directions. The direction from the
-        lower to the higher ID comes first. The losses by the radio model are added to these losses.
+        lower to the higher ID comes first. A message must survive both this loss and the loss by the radio model.
         """
         self._radio_losses: dict[Pair, float] = {}
 

@@ -176,8 +176,8 @@ class RunDirectory:
         self._append(NETWORK_FILE, record)
 
     def append_injected(self, record: Mapping[str, Any]) -> None:
-        """Append an entry about the rogue node at mission second `at_s`: one datagram that it sent, or a number of
-        datagrams.
+        """Append an entry about the rogue node at mission second `at_s`. The entry describes one datagram that the
+        rogue node sent, or states the number of datagrams.
         """
         self._append(ROGUE_FILE, record)
 

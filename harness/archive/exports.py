@@ -52,9 +52,8 @@ EncodedEventData = Annotated[Base64, Field(max_length=4 * (MAX_EVENT_DATA_BYTES 
 
 
 class ExportedBlock(BaseModel):
-    """An exported block. `chain_hash` is null if the block is not in the chain.
-
-    `signature` exists only in a secured mission. The agent that completed the block made it.
+    """An exported block. `chain_hash` is null if the block is not in the chain. `signature` is the signature of the
+    agent that completed the block. It exists only in a secured mission.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
@@ -98,7 +97,7 @@ class CurrentBlock(BaseModel):
 
 
 class ExportedHead(BaseModel):
-    """The signed head of an export in a secured mission. The agent contract defines the signed bytes."""
+    """The signed head of an export in a secured mission. The agent contract defines which bytes are signed."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, defer_build=True)
 

@@ -1,7 +1,8 @@
 """Compute the history of a run from traces: votes, reconciles and commits of each agent, and the messages between
 agents.
 
-The traces are the only source. If an agent is lost, or the run ends, its vote and its reconcile end at that time.
+The traces are the only source. A vote or reconcile that is in progress ends when its agent is lost, or when the run
+ends.
 """
 
 import math
@@ -86,7 +87,7 @@ class AgentReconcile:
 
 @dataclass(frozen=True, slots=True)
 class BlockCommit:
-    """A block was appended to a chain. `how` is one of the values of COMMITTED_BY."""
+    """The commit of a block: the agent appended the block to its chain. `how` is one of the values of COMMITTED_BY."""
 
     agent: int
     at_s: float

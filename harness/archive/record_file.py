@@ -21,12 +21,13 @@ from ucp.short_value import shown
 
 Model = TypeVar("Model", bound=BaseModel)
 Place = tuple[dict[Any, Any] | list[Any], Any]
-"""The place of a part in a document: the object or list that contains the part, and the key or index of the part in it.
+"""The place of a part in a document, as a pair: the object or list that contains the part, and the key or index at
+which it contains the part.
 """
 
 MAX_ROUNDS = 100
-"""Maximum number of validations. Each validation removes the invalid parts that it finds, and the depth of a document
-limits the number of such parts.
+"""Maximum number of validations. After each validation, the invalid parts are removed. The object that contained a
+removed part may then be invalid, too, so the depth of a document limits the number of validations.
 """
 MAX_NAME = 80
 UNKNOWN_KEY = "extra_forbidden"
@@ -132,8 +133,8 @@ def _remove(places: Sequence[Place]) -> None:
 
 MAX_BYTES = 40 * 1024 * 1024
 MAX_WEIGHT = 2_000_000
-"""Maximum weight of a run.json, which measures the memory that its values need (see `ucp.plain_file`). A file whose
-scenario has 100,000 scripted message fates has less weight.
+"""Maximum weight of a run.json. The weight of a text is a measure of the memory that its JSON values need (see
+`ucp.plain_file`). A file whose scenario has 100,000 scripted message fates has less weight.
 """
 
 
@@ -156,10 +157,9 @@ class RecordFile:
 
 
 def read_record(path: Path) -> RecordFile:
-    """Read the file run.json at `path`. If no part of it can be used, the result has an `error`.
-
-    The error is a DamagedRecordError if the file is damaged. It is of another class if the file is intact but has a
-    different schema.
+    """Read the file run.json at `path`. If no part of the file can be used, the result has an `error`. The error is a
+    DamagedRecordError if the file is damaged. If the file is intact but has a different schema, the error is of another
+    class.
     """
     try:
         return _read(path)
@@ -202,9 +202,8 @@ _SCRIPTS = ("fates", "datagrams")
 
 
 def _exceeds(document: Any, most: int) -> bool:
-    """Return true if a document has more than `most` values, not counting the scripted messages of its scenario.
-
-    The scripts are not counted, because their validation ends at the first error.
+    """Return true if a document has more than `most` values. The scripted messages of its scenario are not counted,
+    because their validation ends at the first error.
     """
     parts: list[Any] = [document]
     count = 0

@@ -57,10 +57,9 @@ def replication_of(traces: Mapping[int, Trace], faults: Iterable[FaultRecord]) -
 
 
 class _LivingChains:
-    """The chains of the living agents, with counts of the blocks in them.
-
-    A prefix consists of the first blocks of a chain. Each prefix gets a number, and equal prefixes of different chains
-    get the same number. The class therefore compares numbers to find a common prefix.
+    """The chains of the living agents, with counts of the blocks in them. A prefix consists of the first blocks of a
+    chain. Each prefix is assigned a number, and equal prefixes of different chains have the same number. To compare two
+    prefixes, the class therefore needs to compare only their numbers.
     """
 
     def __init__(self, agents: Iterable[int]) -> None:

@@ -34,8 +34,8 @@ class LagLine(BaseModel):
     machine_s: _Seconds
     busy_s: dict[AgentKey, _Seconds]
     computer_of: AgentKey | None = None
-    """The remote agent whose computer was measured. If the computer runs several agents, they are the keys of `busy_s`.
-    null for the machine of the harness.
+    """The ID of a remote agent. The line describes the computer of this agent. If the computer runs several agents,
+    `busy_s` has a key for each of them. null for the machine of the harness.
     """
 
 

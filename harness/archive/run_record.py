@@ -131,14 +131,16 @@ class CycleStep(_RecordModel):
 
 
 class CycleWait(_RecordModel):
-    """An agent that cannot finish. The agents in `for_agents` never answer its queries. The agents in `refused_by`
-    disapprove its blocks.
+    """An agent that cannot finish. The agents in `for_agents` never answer the queries of this agent. The agents in
+    `refused_by` disapprove the blocks of this agent.
     """
 
     agent_id: int
     for_agents: list[int] = []
     refused_by: list[int] = []
-    """The agents that disapprove its blocks. Also empty if no trace contains the votes."""
+    """The agents that disapprove the blocks of the waiting agent. The list is also empty if no trace contains the
+    votes.
+    """
 
 
 class Cycle(_RecordModel):
@@ -237,7 +239,9 @@ class ChannelLateness(_RecordModel):
     """Lateness that one in twenty deliveries exceeded."""
     most_s: float
     by_interval_s: list[float]
-    """The greatest lateness of a delivery in each interval of the load."""
+    """The greatest lateness of a delivery in each interval. The intervals are those of the key `load` of the
+    channel.
+    """
     missed: int
     """Number of broadcasts that the process did not receive, because its buffer was full."""
     unsent: int
@@ -364,7 +368,7 @@ class RemoteRecord(_RecordModel):
     """
 
     host: str
-    """Address from which it joined last."""
+    """Address from which the agent joined last."""
     worker: str | None = None
     """Address of the Dask worker that played the agent. null if a user let the agent join."""
     command: list[str] = []
@@ -374,15 +378,15 @@ class RemoteRecord(_RecordModel):
     epoch_us: int | None = None
     """Mission second 0 in the time of that computer's clock."""
     offset_s: float | None = None
-    """Time by which that clock was ahead."""
+    """Time by which the clock of that computer was ahead of the harness's clock."""
     uncertainty_s: float | None = None
     """Maximum error of `offset_s`: half of the shortest round trip."""
     drift: float | None = None
-    """Relative error of the rate of that clock."""
+    """Relative error of the rate of that computer's clock."""
     delay_s: float | None = None
     """Delay of the connection in one direction: the median half of a round trip."""
     delay_p95_s: float | None = None
-    """One in twenty delays was longer."""
+    """Delay that one in twenty delays of the connection exceeded."""
     delay_most_s: float | None = None
     """Longest delay in all incarnations."""
     pings: int = 0
@@ -492,9 +496,8 @@ class InjectedMessages(_RecordModel):
 
 class RogueInjection(_RecordModel):
     """The effect of one injection. `refused` contains the numbers of datagrams that are not valid messages, by reason.
-    Agents drop such datagrams and count them.
-
-    `untraced` is the number of copies that traces do not distinguish from the originals.
+    Agents drop such datagrams and count them. `untraced` is the number of copies that are missing in `messages`,
+    because traces do not distinguish these copies from the originals.
     """
 
     at_s: float

@@ -40,8 +40,8 @@ class TraceHeader(BaseModel):
     """The header of a trace. `initial_data` is in base64. It is None in version 1 of the format, which does not record
     complete inputs.
 
-    In a `secured` mission the recorded datagrams are not encrypted. The datagrams that were sent were longer, and a
-    datagram that seems valid in the trace may have been dropped.
+    In a `secured` mission, agents encrypt each datagram, but the trace records the datagram without encryption. The
+    datagram on the network was therefore longer. An agent may have dropped a datagram that looks valid in the trace.
     """
 
     model_config = ConfigDict(extra="ignore", populate_by_name=True, defer_build=True)
@@ -92,8 +92,8 @@ _ONLY_RECEIVES = re.compile(
     "reconciling":(?:true|false),"idle":(?:true|false),"top":"[0-9a-f]*"\}\}\n""",
     re.VERBOSE,
 )
-"""A pattern for a line of a handler run that received a message and changed nothing, in the form in which this
-project's agents write it. A line that matches needs no further validation.
+"""A pattern for the line of a handler run that received a message and changed nothing. The pattern matches only lines
+in the form that this project's agents write. A line that matches is valid, and is not validated again.
 """
 
 _LOST = re.compile(rb'\{"lost_lines":(\d{1,9}),"lost_bytes":(\d{1,12})\}')
@@ -130,9 +130,9 @@ class Trace:
     """The trace of one agent, including all its restarts.
 
     `starts` contains, for each incarnation after the first, the index in `runs` of its first handler run. `asides`
-    contains the entries that are no handler runs. Each has the number of handler runs before it. A trace from the field
-    (`harness.field.ingest`) may have `gaps`. The trace of a run has no gaps, because reading ends at the first damaged
-    line.
+    contains the entries that are no handler runs. Each aside is stored with the number of handler runs that precede it.
+    A trace from the field (`harness.field.ingest`) may have `gaps`. The trace of a run has no gaps, because reading
+    ends at the first damaged line.
     """
 
     header: TraceHeader
@@ -148,8 +148,8 @@ class Trace:
     agent's clock was probably set before these handler runs.
     """
     lines: tuple[Sequence[int], Sequence[int]] | None = None
-    """The line numbers in the file of the entries in `runs`, and those of the entries in `asides`. None if the file has
-    no other lines, apart from headers.
+    """The line numbers in the file: those of the entries in `runs`, and those of the entries in `asides`. None if the
+    line numbers follow from the positions, because each line of the file is a header or one of these entries.
     """
 
     def incarnations(self) -> Iterator[Iterator[tuple[int, HandlerRun]]]:

@@ -17,7 +17,7 @@ UnknownNames = dict[Kind, str]
 """Kind -> a description of the first unknown name of that kind, such as "unknown timer name 'x'"."""
 
 CRASHED = "crashed by quirk"
-"""The branch of a wrong agent's handler that raised an exception."""
+"""The branch that is recorded if a handler of a wrong agent raised an exception."""
 
 BRANCHES = {
     name: frozenset((*branches, CRASHED))
@@ -69,8 +69,8 @@ BRANCHES = {
         "reconcile_finalize": ("asked who follows", "recommitted, more to come", "done"),
     }.items()
 }
-"""Handler -> the branches that it can take, including those of wrong agents. They are written out here, because the
-checker must not read them from the agent core that it judges.
+"""Handler -> the branches that the handler can take, including those of wrong agents. This table repeats the names from
+the agent core, because the checker must not read them from the agent core that it judges.
 """
 
 TIMER_OF = {

@@ -25,7 +25,7 @@ GRACE_S = 30.0
 
 @dataclass(frozen=True)
 class ProcessResult:
-    """The result of a process."""
+    """The result of a process that ended or was stopped."""
 
     status: int | None
     """The exit status. None if the process exceeded its time limit and was stopped."""

@@ -39,8 +39,8 @@ class ChannelModel(StrictModel):
     with spreading factor 7 to 12.
     """
     processing_s: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)] = 0.005
-    """Maximum time in seconds from the decision to send a message until the radio gets the message. The time of each
-    message is random, uniform from 0 to this value.
+    """Maximum time in seconds from the decision to send a message until the radio receives the message for sending. The
+    time of each message is random, uniform from 0 to this value.
     """
     power_dbm: float | None = None
     """Transmit power in dBm."""

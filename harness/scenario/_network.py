@@ -1,9 +1,9 @@
 """Describe the network of a scenario: loss, delay, partitions, and radio loss that depends on distance.
 
-The network conditions have three layers: the conditions of all links, of single receivers, and of single links. A layer
-replaces the keys that it contains. `netem.conditions` defines the values and their valid combinations. This module
-defines the notation of the values in a scenario. `NetworkModel` describes the network of the whole mission, and
-`NetworkLayer` a change of it.
+The network conditions have three layers: the conditions of all links, of single receivers, and of single links. A more
+specific layer replaces the values of the keys that it contains. `netem.conditions` defines the values and their valid
+combinations. This module defines the notation of the values in a scenario. `NetworkModel` describes the network of the
+whole mission, and `NetworkLayer` a change of it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -171,12 +171,12 @@ class ConditionOverrides(StrictModel):
     limit.
     """
     limit: Limit | None = None
-    """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
-    messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
+    """Maximum number of messages from one sender to one receiver that wait because of the delay or the rate, 1 to
+    100,000. Further messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
     """
 
     def given(self) -> dict[str, object]:
-        """Return the conditions that were given a value, by key."""
+        """Return the conditions that the scenario sets, by key."""
         return {key: value for key in KEYS if (value := getattr(self, key)) is not None}
 
 
@@ -184,13 +184,15 @@ KEYS = tuple(ConditionOverrides.model_fields)
 
 
 class ReceiverOverrides(ConditionOverrides):
-    """Network conditions for all messages to one vehicle. A missing key keeps the value of the whole network."""
+    """Network conditions for all messages to one vehicle. If a key is missing, the value of the whole network
+    applies.
+    """
 
 
 class LinkOverrides(ConditionOverrides):
     """Network conditions of the links from each vehicle of `from` to each vehicle of `to`.
 
-    A missing key keeps the value of the receiver. Two entries for the same link are an error.
+    If a key is missing, the value of the receiver applies. Two entries for the same link are an error.
     """
 
     model_config = ConfigDict(serialize_by_alias=True)
@@ -248,7 +250,7 @@ class NetworkDisturbance(StrictModel):
     partition: list[list[VehicleId]] | None = None
     """Groups of vehicles. Messages between different groups are lost. Vehicles in no group form a further group."""
     network: NetworkLayer | None = None
-    """Other conditions of the network. Conditions that the key does not contain do not change."""
+    """Other conditions of the network. Conditions that are not listed do not change."""
 
     @model_validator(mode="after")
     def _check_loss(self) -> "NetworkDisturbance":
@@ -291,8 +293,8 @@ class NetworkModel(StrictModel):
     limit.
     """
     limit: Limit = "none"
-    """Number of messages from one sender to one receiver that may wait for delay or rate, 1 to 100,000. Further
-    messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
+    """Maximum number of messages from one sender to one receiver that wait because of the delay or the rate, 1 to
+    100,000. Further messages are lost. With `none`, there is no limit. A `limit` requires a `delay` or a `rate`.
     """
     receivers: dict[VehicleKey, ReceiverOverrides] = {}
     """Conditions of single receivers, by vehicle ID."""
@@ -360,7 +362,7 @@ def scope_in_words(scope: Scope) -> str:
 
 
 def conditions_of(network: NetworkValues, partition: tuple[frozenset[int], ...] = ()) -> NetworkConditions:
-    """Combine single values to network conditions. Raises ConditionsError if the values contradict each other."""
+    """Convert network values to network conditions. Raises ConditionsError if the values contradict each other."""
     for_all = network[None]
     conditions: dict[Scope, LinkConditions] = {}
     known: dict[tuple[Any, ...], LinkConditions] = {}  # of many links there are few kinds

@@ -33,9 +33,9 @@ MAX_NUMBER = 200
 class YamlLoader(Composer, CParser, SafeConstructor, Resolver):
     """A safe loader that rejects duplicate keys, deep nesting, many values, and long numbers.
 
-    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. An alias counts as many values as its
-    anchor contains, because a few lines of aliases can stand for gigabytes. The time to convert a number grows with the
-    square of its length.
+    YAML forbids duplicate keys, but the safe loader of PyYAML uses the last one. When the loader counts values, it
+    counts those in the anchor again for each alias of the anchor, because a few lines of aliases can stand for
+    gigabytes. The time to convert a number grows with the square of its length.
     """
 
     def __init__(self, text: str) -> None:

@@ -241,12 +241,16 @@ class EventOptions(StrictModel):
 
 
 class RemoteOptions(StrictModel):
-    """Agents that run on other computers, and join a run with processes from there."""
+    """Agents that run on other computers, and connect to the run over the network. The run needs the backend
+    `process`.
+    """
 
     agents: Annotated[list[VehicleId], Field(min_length=1, max_length=MAX_REMOTE)]
     """IDs of the agents that run on other computers."""
     secret_file: Annotated[str, Field(min_length=1, max_length=4000)]
-    """File with the secret that the other computers also have. `ucp-harness join --new-secret FILE` makes one."""
+    """File with the secret that the other computers also have. `ucp-harness join --new-secret FILE` creates the
+    file.
+    """
     listen: Annotated[str, Field(max_length=300)] | None = None
     """ADDRESS:PORT at which the harness waits for remote agents. Default: the run needs the option `--listen`."""
 

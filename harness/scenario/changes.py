@@ -15,7 +15,9 @@ from harness.scenario.injection import Injection, InjectionName
 from netem.conditions import Delay, GilbertElliott, LinkConditions, NetworkConditions
 
 RANGE = "range"
-"""Name of a network change that the flight of vehicles causes, and not the scenario."""
+"""Name of a network change that the scenario does not contain. It occurs because flying vehicles change their
+distances.
+"""
 FINAL_RECONCILE = "final reconcile"
 """Name of the network change before the final reconcile."""
 NO_MORE_FATES = "no more fates"
@@ -42,7 +44,7 @@ class NetworkChange:
     """Preset of the radio channel that vehicles share. On a shared channel, any message may be lost."""
 
     def to_json(self, at_s: float) -> dict[str, object]:
-        """Return the record of this change. It was made at mission second `at_s`."""
+        """Return the record of this change. `at_s` is the mission second at which the change was really made."""
         return {
             "at_s": at_s,
             "what": self.what,
@@ -71,7 +73,7 @@ class TimedInjection:
         return self.injection.in_words()
 
     def to_json(self, at_s: float) -> dict[str, object]:
-        """Return the record of this injection. It started at mission second `at_s`."""
+        """Return the record of this injection. `at_s` is the mission second at which the injection really started."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail}
         return {**record, **planned_key(self.at_s, at_s), **_by_hand_entry(self.by_hand)}
 

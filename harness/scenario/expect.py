@@ -148,9 +148,9 @@ class Expect(StrictModel):
     `steps` is given, its value must be `deviates`.
     """
     backends: Annotated[list[BackendName], Field(min_length=1)] = ["sim"]
-    """Backends to play, each once."""
+    """Backends with which pytest runs the scenario. Each backend may occur once."""
     seeds: Annotated[list[Annotated[int, Field(ge=0, strict=True)]], Field(min_length=1, max_length=10_000)] = [1]
-    """Seeds to play, each once."""
+    """Seeds with which pytest runs the scenario. Each seed may occur once."""
 
     @field_validator("characteristics", mode="before")
     @classmethod
@@ -204,8 +204,9 @@ class Expect(StrictModel):
         return kind_of(verdict) != "bad" if expected is None else verdict == expected
 
     def remark(self, key: str, verdict: str) -> str:
-        """Return the remark on a verdict. It is "as expected" if the scenario expects this verdict although it is not
-        good, "expected: holds" if the scenario expects another verdict, and otherwise empty.
+        """Return the remark on a verdict. If the scenario expects another verdict, the remark names it, such as
+        "expected: holds". If the scenario expects this verdict although it is not good, the remark is "as expected".
+        Otherwise it is empty.
         """
         expected = self.verdict(key)
         if verdict == expected:
@@ -225,8 +226,8 @@ class Expect(StrictModel):
     ) -> Iterator[tuple[str, list[str]]]:
         """Yield each kind of expectation other than verdicts, with a sentence for each unmet expectation of this kind.
 
-        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` its top. `found` has an agent and a
-        handler for each deviation.
+        `chains` contains the block hashes of each agent's chain, and `top_chain_hashes` contains its top chain hash.
+        `found` contains the agent and the handler of each deviation.
         """
         if self.figures:
             yield "expected figures", list(self.out_of_range(figures))
@@ -272,9 +273,8 @@ class Expect(StrictModel):
                 yield f"{common_to} {_has(shared)}, and should have {common.blocks.describe()}"
 
     def unexpected_deviations(self, found: Iterable[tuple[int, str | None]]) -> Iterator[str]:
-        """Yield a sentence for each agent whose first deviation differs from the expected one.
-
-        `found` has an agent and a handler for each deviation, in time order.
+        """Yield a sentence for each agent whose first deviation differs from the expected one. `found` contains the
+        agent and the handler of each deviation, in time order.
         """
         if not self.deviations:
             return

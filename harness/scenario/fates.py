@@ -67,11 +67,13 @@ class Fate(StrictModel):
     block: Annotated[BlockName | None, BeforeValidator(_quoted)] = None
     """Block that the message concerns: an agent and the number of its block, in quotes, as in "4.11"."""
     count: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=1)]] | None = None
-    """Which of the matching messages: a number, counted from 1, or a list of numbers. By default, all of them."""
+    """Number of the matching message to which the rule applies, counted from 1, or a list of such numbers. By default,
+    the rule applies to all matching messages.
+    """
     from_s: MissionSecond | None = None
-    """First mission second at which the message may have been sent."""
+    """A message matches only if it was sent at or after this mission second."""
     until_s: MissionSecond | None = None
-    """Mission second before which the message must have been sent. It must be later than `from_s`."""
+    """A message matches only if it was sent before this mission second, which must be later than `from_s`."""
 
     drop: Literal[True] | None = None
     """If true, the message is lost."""

@@ -29,8 +29,8 @@ def scenario_names() -> list[str]:
 
 
 def find_file(path: Path) -> Path:
-    """Return the path of the included scenario that `path` names. If a file `path` exists, or no included scenario has
-    this name, return `path`.
+    """Return `path` if this file exists. If it does not exist and `path` is the name of an included scenario, return
+    the path of this scenario. Otherwise return `path`.
     """
     file_name = f"{path}.yaml"
     if len(path.parts) != 1 or not LIBRARY.is_dir() or file_name not in (file.name for file in LIBRARY.iterdir()):
@@ -101,9 +101,8 @@ def parse_yaml(text: str) -> Any:
 
 
 def read_yaml(path: Path, what: str) -> dict[str, object]:
-    """Return the mapping in a YAML file, or in the included file of this name. Error messages call it `what`.
-
-    Raises ScenarioError.
+    """Return the mapping in a YAML file, or in the included file of this name. `what` is the word for such a file in
+    error messages, such as "scenario". Raises ScenarioError.
     """
     path = find_file(path)
     try:

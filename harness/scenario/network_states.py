@@ -124,8 +124,8 @@ def network_steps(
 
 
 def refuse_ambiguous_overlaps(timeline: Sequence[TimelineEntry]) -> None:
-    """Raise ValueError if a change starts during an earlier temporary change of the same value, but ends after this
-    change. The result would be ambiguous.
+    """Raise ValueError if a change starts during an earlier temporary change of the same value, but ends after the
+    earlier change. The result would be ambiguous.
     """
     active: dict[tuple[Scope, str], list[tuple[float, int]]] = defaultdict(list)
     for number, entry in sorted(enumerate(timeline), key=lambda numbered: numbered[1].at_s):

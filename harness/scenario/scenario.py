@@ -141,8 +141,9 @@ class Scenario(StrictModel):
     capture: bool = False
     """True if the run writes all frames that a vehicle sent or received to capture/<ID>.pcapng."""
     trace_quota_mb: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
-    """Maximum size of all traces together, in megabytes, but at least 8 for each agent. Each agent has an equal share,
-    and its trace ends early when the share is used up. By default, the maximum is half of the free disk space.
+    """Maximum size of all traces together, in megabytes. Each agent may use an equal share, but at least 8 megabytes.
+    If the trace of an agent reaches its share, the trace ends early. By default, the maximum is half of the free disk
+    space.
     """
     gcs: Annotated[str, Field(max_length=300)] | None = None
     """HOST:PORT of a ground station, usually 127.0.0.1:14550. The ground station receives the telemetry of all vehicles

@@ -162,7 +162,7 @@ Pairs = frozenset[tuple[int, int]]
 
 @dataclass(frozen=True)
 class TemporaryChange:
-    """A temporary change of the network by a schedule. A change without values has no effect."""
+    """A temporary change of the network by a schedule. If all fields are empty, the change has no effect."""
 
     values: NetworkValues = field(default_factory=dict)
     partition: tuple[frozenset[int], ...] = ()
@@ -342,8 +342,8 @@ def _isolate(shuffled: list[int]) -> TemporaryChange:
 
 
 def _majorities_ring(shuffled: list[int]) -> TemporaryChange:
-    """Return a change in which each vehicle receives only its nearest neighbours on a ring. Each vehicle and its
-    neighbours form a different majority.
+    """Arrange the vehicles in a ring. Return a change in which each vehicle receives messages only from its nearest
+    neighbours in the ring. A vehicle and these neighbours form a majority, which is different for each vehicle.
     """
     size = len(shuffled)
     reach = (size // 2 + 1) // 2

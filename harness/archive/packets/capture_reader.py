@@ -213,7 +213,7 @@ NAMES = {code: message.NAME for message, code in TYPE_CODES.items()}
 _LAST_NS = 2**63 - 1
 
 ListenerName = int | str
-"""The ID of the vehicle that captured, or the name of a separate observer."""
+"""The ID of the vehicle whose network interface was captured, or the name of a separate observer."""
 
 
 class CaptureComment(BaseModel):

@@ -72,11 +72,11 @@ class DatagramRecord(BaseModel):
     """One datagram, sent once. `number` is its position in the order of sending. `answers` is null if the message is
     not a request.
 
-    `origin` is `captured` (the capture of its sender contains it), `inferred` (its sender was not captured at that
-    time, and `at_s` is the time of the first reception) or `forged` (the agent that it names did not send it). The
-    vehicles in `lost_by` were captured but did not receive the datagram. The vehicles in `not_listening` were not
-    captured. `loss_reasons` lists vehicles of `lost_by` by the reason why the shared channel lost the message. The key
-    is missing without such a loss.
+    `origin` is `captured` (the capture of the sender contains the datagram), `inferred` (the sender was not captured at
+    that time, and `at_s` is the time of the first reception) or `forged` (the agent that the datagram names as its
+    sender did not send it). The vehicles in `lost_by` were captured but did not receive the datagram. The vehicles in
+    `not_listening` were not captured. `loss_reasons` lists vehicles of `lost_by` by the reason why the shared channel
+    lost the message. The key is missing without such a loss.
     """
 
     number: int

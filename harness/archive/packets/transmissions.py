@@ -19,9 +19,9 @@ from harness.archive.packets.pcap import OUTBOUND
 from harness.archive.run_journals import CHANNEL_FILE, ChannelLine
 
 Origin = Literal["captured", "inferred", "forged"]
-"""The origin of a transmission. `captured` means that the capture of its sender contains it. `inferred` means that its
-sender was not captured at that time, so `at_s` is the time of the first reception. `forged` means that the agent that
-it names did not send it.
+"""The origin of a transmission. `captured` means that the capture of the sender contains the transmission. `inferred`
+means that the sender was not captured at that time, so `at_s` is the time of the first reception. `forged` means that
+the agent that the datagram names as its sender did not send it.
 """
 
 
@@ -82,8 +82,8 @@ class _Listeners:
         return any(capture.listening(time_ns) for capture in self._transmissions.get(name, ()))
 
     def would_record_sending(self, sender: ListenerName, time_ns: int) -> bool:
-        """Return true if the captures of the sender must contain a datagram that the sender sent at this time. This is
-        not certain if the captures contain only received datagrams, or lack frames.
+        """Return true if the captures of the sender must contain each datagram that the sender sent at this time. This
+        is not certain if the captures contain only received datagrams, or lack frames.
         """
         captures = self._transmissions.get(sender, ())
         sound = any(capture.sees_itself for capture in captures) and not any(capture.dropped for capture in captures)

@@ -146,7 +146,9 @@ class Fault:
 
     @classmethod
     def loses_data(cls, disk: DiskState | None) -> bool:
-        """True if the agents lose all their data in this fault. `disk` is the state of their disks before the fault."""
+        """True if the agents lose all their data because of this fault. `disk` is the state of their disks before the
+        fault.
+        """
         return cls.ends_incarnation and not cls.exports_chain and disk != "kept"
 
     @classmethod
@@ -165,7 +167,7 @@ class Fault:
         return agents if self.disk_after is None else f"{agents}, disk {self.disk_after}"
 
     def to_json(self, at_s: float) -> dict[str, object]:
-        """Return the record of this fault. It happened at mission second `at_s`."""
+        """Return the record of this fault. `at_s` is the mission second at which the fault really happened."""
         record = {"at_s": at_s, "what": self.what, "detail": self.detail, "agents": list(self.agents)}
         hand = {"by_hand": True} if self.by_hand else {}
         disk = {} if self.disk_after is None else {"disk": self.disk_after}
@@ -177,7 +179,7 @@ SAME_TIME_S = 0.001
 
 
 def planned_key(planned_s: float, at_s: float) -> dict[str, float]:
-    """Return the key `planned_s` for the record of a change that was made after its planned time. For a punctual
-    change, return no key.
+    """Return the key `planned_s` for the record of a change that was made later than planned. For a change that was
+    made in time, return no key.
     """
     return {} if abs(planned_s - at_s) < SAME_TIME_S else {"planned_s": planned_s}

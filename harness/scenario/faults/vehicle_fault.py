@@ -203,7 +203,7 @@ class LoseRc(VehicleFault):
 
 
 class RegainRc(VehicleFault):
-    """The receivers of these vehicles get the signal of the remote control again."""
+    """The receivers of these vehicles receive the signal of the remote control again."""
 
     what = "regain_rc"
     mark = RISING
@@ -229,7 +229,9 @@ class StopMotor(VehicleFault):
 
 @dataclass(frozen=True)
 class Wind(VehicleFault):
-    """The wind at these vehicles changes to `wind_ms` from `from_deg`. A speed of 0 ends the wind."""
+    """The wind at these vehicles changes: it now blows at the speed `wind_ms` from the direction `from_deg`. A speed of
+    0 ends the wind.
+    """
 
     wind_ms: Annotated[float, Field(ge=0, le=60, allow_inf_nan=False)]
     from_deg: Annotated[float, Field(ge=0, lt=360, allow_inf_nan=False)]
