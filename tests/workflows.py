@@ -26,7 +26,7 @@ _EXPRESSION = re.compile(r"\$\{\{(.*?)\}\}")
 
 
 class Names(dict[str, Any]):
-    """A part of the context of an expression. Its values can also be read as attributes."""
+    """A mapping that expressions of a workflow can use, such as `github`. Its values can also be read as attributes."""
 
     def __getattr__(self, name: str) -> Any:
         return self[name]
@@ -50,7 +50,7 @@ class Runner:
 
     workspace: Path
     tools: Path
-    """A directory with programs, which replace those of the system with the same names."""
+    """A directory with programs. They replace the programs of the system that have the same names."""
     caches: dict[str, Path] = field(default_factory=dict)
     """The directory with the saved files of each cache key. The oldest key is first."""
     artifacts: dict[str, list[Path]] = field(default_factory=dict)

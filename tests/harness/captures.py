@@ -174,7 +174,7 @@ class Captures:
         }
 
     def write(self, run: Path, *without: int) -> Path:
-        """Write complete packet captures into a run directory, without those of the vehicles in `without`."""
+        """Write complete packet captures into a run directory. Omit the captures of the vehicles in `without`."""
         for file in self.files.values():
             file.statistics(wall_ns(self.air.now))
         return write_files(run, self.files, without)

@@ -25,7 +25,7 @@ def harness(
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end, and return its output.
 
-    By default, COLUMNS is not set. A worker of pytest-xdist sets it, but output in a pipe has no width.
+    By default, remove the variable COLUMNS, which a worker of pytest-xdist sets, because output in a pipe has no width.
     """
     if env is None:
         env = {name: value for name, value in os.environ.items() if name != "COLUMNS"}

@@ -82,7 +82,7 @@ class Air:
         return program
 
     async def run(self, vehicle: int, *arguments: object) -> None:
-        """Run a program that sends, until it ends."""
+        """Run a program that sends frames, and wait until it ends."""
         program = await self.start(vehicle, *arguments)
         assert await asyncio.wait_for(program.process.wait(), 4 * DEADLINE_S) == 0, program.output.read_text()
 

@@ -139,7 +139,9 @@ def one_question(asked: float) -> NetworkStudy:
 
 
 def losing(*shares: float) -> tuple[list[tuple[NetworkStudy, int]], EngineMeasurement]:
-    """Return a measurement of a network that loses these shares of packets, and its results."""
+    """Measure a network that loses the next of these shares of packets in each measurement. Return the requested
+    measurements, and the result.
+    """
     asked: list[tuple[NetworkStudy, int]] = []
     kept = iter(shares)
 

@@ -19,7 +19,7 @@ TURN_S = 0.005
 
 
 class Puppet:
-    """An embedded vehicle. The function `tamper` may change each frame that it sends. Simulated time runs at
+    """An embedded vehicle. The function `tamper` may change each frame that the vehicle sends. Simulated time runs at
     SPEEDUP.
     """
 

@@ -124,7 +124,7 @@ def puppet_flown(
 def failure(tmp_path: Path, strings: Callable[[Puppet], None], after_m: float = 25.0, by: By = "mission") -> str:
     """Return the reason for which a flight of a copter fails.
 
-    The function `strings` changes the vehicle's messages when it has reached a height of `after_m` metres.
+    After the vehicle has reached a height of `after_m` metres, the function `strings` changes its messages.
     """
 
     async def fly() -> str:

@@ -10,7 +10,7 @@ LOOK_EVERY_S = 0.005
 
 
 def run_until(loop: Loop, condition: Callable[[], bool], *, after_s: float = 0.0) -> None:
-    """Run the loop until the condition is true. It is first checked after `after_s` seconds."""
+    """Run the loop until the condition is true. The condition is checked for the first time after `after_s` seconds."""
     deadline = time.monotonic() + DEADLINE_S
     met = False
 

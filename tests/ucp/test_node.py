@@ -109,7 +109,7 @@ class AgentUnderTest:
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    """Return a directory whose path is longer than the path of a Unix socket may be."""
+    """Return a directory whose path exceeds the maximum length of a Unix socket's path."""
     deep = tmp_path / ("d" * 100) / "agents"
     deep.mkdir(parents=True)
     return deep

@@ -49,8 +49,8 @@ def position_msg(ms: int = 60_000, lat: int = -353632620, lon: int = 1491652370)
 
 
 def good_estimate() -> Any:
-    """Return a SYS_STATUS message which reports that the position estimate is good. Without it, positions are not
-    logged.
+    """Return a SYS_STATUS message which reports that the position estimate is good. Without such a message, positions
+    are not logged.
     """
     bit = mavlink.MAV_SYS_STATUS_AHRS
     return mavlink.MAVLink_sys_status_message(bit, bit, bit, 0, 0xFFFF, -1, -1, 0, 0, 0, 0, 0, 0)

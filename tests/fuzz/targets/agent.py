@@ -162,7 +162,7 @@ class _DrivenAgent:
                 return BlockResponse(block)
 
     def _chain_hash(self, choice: int) -> bytes:
-        """Return the hash of the agent's chain or of its beginning, alone or with another block on top."""
+        """Return the chain hash of a block in the agent's chain, or the hash of the chain with another block on top."""
         chain = self.agent.state.chain
         hashes = [chain_hash for _, chain_hash in chain.with_chain_hashes()][::-1]
         hashes += [chain.inception.chain_hash, self.agent.state.top_chain_hash_at_initiation or bytes(32)]

@@ -239,8 +239,8 @@ class _DrivenAgent:
 
 
 def _is_accepted(session: Session, sealed_by: tuple[int, int, bytes]) -> bool:
-    """Return whether the session already accepts datagrams from this start of the sender. It then keeps the keys of
-    this start.
+    """Return whether the session already accepts datagrams from this start of the sender. In this case, the session
+    keeps the keys of this start.
     """
     _, sender, boot = sealed_by
     incarnation = session._incarnations.get(sender)

@@ -32,7 +32,9 @@ def run(data: bytes) -> None:
 
 
 def _lines(trace: Trace) -> list[str]:
-    """Return the skimmed trace as lines. Tests compare these, because a time that is NaN is not equal to itself."""
+    """Return the skimmed trace as lines. Tests compare these lines and not the objects, because a time that is NaN is
+    not equal to itself.
+    """
     return [run.to_line() for run in trace.skimmed().runs]
 
 

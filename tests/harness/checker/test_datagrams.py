@@ -72,7 +72,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def judged(directory: Path, tmp_path: Path, agent: int, more: int, unread: int = 0, others: int = 0) -> Result:
-    """Judge the run with counters of the kernel. They show the datagrams that an agent recorded, and `more` others."""
+    """Judge the run after counters of the kernel were added to it. According to these counters, the agent read the
+    datagrams that it recorded, and `more` others.
+    """
     shutil.copytree(directory, tmp_path / "run")
     lines = [json.loads(line) for line in (directory / f"agents/{agent}.trace.jsonl").read_text().splitlines()]
     received = sum("message" in line.get("trigger", {}) for line in lines)

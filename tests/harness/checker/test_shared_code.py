@@ -22,8 +22,8 @@ READS_FOR_THE_JUDGE = {"harness.archive.traces", "harness.archive.vocabulary", "
 
 
 def judge() -> Iterator[str]:
-    """Yield the modules of the reference implementation, of the comparison of steps, and of the readers of its
-    records.
+    """Yield the modules that judge the steps of agents: the reference implementation, the comparison of steps, and the
+    readers of the records.
     """
     rooms = ("harness.checker.reference", "harness.checker.steps")
     yield from (name for name in modules() if name.startswith(rooms) and name not in NOT_THE_JUDGE)

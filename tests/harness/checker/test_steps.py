@@ -338,7 +338,7 @@ def test_agent_is_followed_after_a_wrong_boot() -> None:
 
 
 def left_out(good: Any, core: Core, *inputs: object, branch: str) -> str:
-    """Return the branch without doing anything, in place of a handler."""
+    """Do nothing, and return the branch. The function replaces a handler."""
     return branch
 
 

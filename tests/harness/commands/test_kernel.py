@@ -169,8 +169,8 @@ class _UmlProgram:
         pytest.fail(f"it ended before it said {word}: {self.process.communicate()}")
 
     def remaining_processes(self) -> list[str]:
-        """Return the command lines of the program's User Mode Linux processes. They contain the name of its
-        directory.
+        """Return the command lines of the User Mode Linux processes that the program started. Each of them contains the
+        name of the directory `temporary`.
         """
         found = []
         for entry in Path("/proc").iterdir():

@@ -41,7 +41,9 @@ NOT_VISIBLE = {
 
 
 def free_address() -> str:
-    """Return an address of this machine with a free port, because other tests listen at the same time."""
+    """Return an address of this machine with a free port. A fixed port may be in use, because other tests listen at the
+    same time.
+    """
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return f"127.0.0.1:{listener.getsockname()[1]}"
 

@@ -38,7 +38,7 @@ def wrong_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def state_of(player: RecordPlayer) -> Any:
-    """Return the state of the reference and the result so far. Tests compare them."""
+    """Return the state of the reference and the result so far, in a form that tests can compare."""
     state = {name: value for name, value in vars(player.state).items() if "timer" not in name and name != "running"}
     state["chain"] = (player.state.chain.top_chain_hash, list(player.state.chain))
     state.pop("_moved")

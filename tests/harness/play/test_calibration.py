@@ -28,7 +28,7 @@ STUDY = NetworkStudy(NetworkConditions(), (MeasuredQuantity(1, 4, "loss 0.15", "
 
 
 def losing(*shares: float) -> Observer:
-    """Return a function in place of a measurement. At each call, it reports the next one of these loss rates."""
+    """Return a function that replaces a measurement. Each call of the function reports the next of these loss rates."""
     streams = iter(shares)
 
     def observe(study: NetworkStudy, packets: int) -> Mapping[tuple[int, int], ReceivedStream]:

@@ -20,7 +20,9 @@ pytestmark = pytest.mark.lab
 
 MOMENTS = 20
 LAST_MOMENT_S = 3.5
-"""Maximum time of a kill in seconds. The run takes about four seconds, of which the mission takes two."""
+"""Latest time of a kill, in seconds after the start of the run. The run takes about four seconds, including two seconds
+for the mission.
+"""
 GONE_WITHIN_S = 10.0
 MARK = "UCP_TEST_MARK"
 

@@ -68,7 +68,8 @@ def at_most(cell: str) -> int | None:
 def one_chain(proof: Proof) -> str:
     """Return the text in the page's column about one chain.
 
-    It has the numbers of further votes that states need, and how many states need each number.
+    The text states how many further votes the states need. In brackets, it lists how many states need at least 1 vote,
+    2 votes, and so on.
     """
     live = proof.liveness
     if live is None:

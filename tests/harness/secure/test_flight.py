@@ -42,7 +42,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> KeyDirectory:
 
 @pytest.fixture(scope="module")
 def flown(home: KeyDirectory) -> Path:
-    """The run."""
+    """Play the secured flight, and return its run directory."""
     directory = home.directory.parent
     security = {"keys": str(home.directory), "seal": True, "captured": 3}
     (directory / "flight.yaml").write_text(json.dumps({**SCENARIO, "security": security}))

@@ -24,7 +24,9 @@ def place(east_m: float, up_m: float = 0.0) -> Place:
 
 
 def channel(radio: Radio, *metres: float, seed: int = 1) -> Channel:
-    """Return a channel between vehicles on a line. The numbers are their distances from its beginning in metres."""
+    """Return a channel between vehicles on a line. The numbers are the distances of the vehicles from the beginning of
+    the line, in metres.
+    """
     made = Channel(range(1, len(metres) + 1), radio, seed)
     made.move([place(east_m) for east_m in metres], 0.0)
     return made

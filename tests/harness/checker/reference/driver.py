@@ -176,9 +176,8 @@ def agent_with_stack(chain_count: int, stack_count: int, **settings: Any) -> Age
 
 
 def agent_in_phase_3_with_stack(stack_count: int, chosen: bytes, **settings: Any) -> tuple[Agent, list[Step]]:
-    """Return an agent whose reconcile phase 2 has chosen the block `chosen`, and the last handler runs.
-
-    The agent has removed its whole chain before.
+    """Return an agent and its last handler runs. The agent has removed its whole chain, and has then chosen the block
+    `chosen` in reconcile phase 2.
     """
     agent = agent_with_stack(0, stack_count, **settings)
     answer_phase_1(agent, 2, contained=True)

@@ -28,8 +28,8 @@ GOOD = {**dict.fromkeys("123456", "holds"), "steps": "as specified", "records": 
 
 
 class Hosts(Cluster):
-    """Workers whose agents have their files in the directory `files`. An environment variable of the workers names
-    it.
+    """Workers whose agents have their files in the directory `files`. An environment variable of the workers names this
+    directory.
     """
 
     def __init__(self, directory: Path, stack: contextlib.ExitStack) -> None:

@@ -43,7 +43,9 @@ halt -f
 
 @pytest.fixture
 def computers(tmp_path: Path) -> Iterator[TwoComputers]:
-    """Yield two computers. The harness runs on the first. It has a TAP interface for the guest, which joins."""
+    """Yield two computers. The harness runs on the first computer. A guest joins through the TAP interface of this
+    computer.
+    """
     require_uml()
     create_secret(tmp_path / "lab.key")
     with TwoComputers(tmp_path) as both:
@@ -54,7 +56,9 @@ def computers(tmp_path: Path) -> Iterator[TwoComputers]:
 
 
 def boot(computers: TwoComputers) -> subprocess.Popen[str]:
-    """Start User Mode Linux beside the computer of the harness. The guest joins with an agent, and then halts."""
+    """Start User Mode Linux as a guest of the harness's computer. The guest joins the run with an agent. After the run,
+    it halts.
+    """
     kernel, directory = uml.find(), computers.directory
     join = [*COMMAND, "join", LISTEN, "--as", "2", "--secret-file", "lab.key", "--", *OUR_AGENT]
     init = directory / "init"

@@ -31,7 +31,7 @@ MISSION = b'{"epoch_us": 1000000}'
 
 
 class FarEnd:
-    """One connection to the stand-in, with the other end in the hands of the test."""
+    """One connection to the stand-in. The test controls the other end of the connection."""
 
     def __init__(self, harness: socket.socket) -> None:
         self._own, other = socket.socketpair()
@@ -119,7 +119,7 @@ def test_datagrams_of_an_earlier_incarnation_are_not_counted(tmp_path: Path) -> 
 
 
 def test_far_end_that_ends_an_earlier_incarnation_begins_again(tmp_path: Path) -> None:
-    """The far end plays an incarnation that the lab killed. It ends this incarnation, and connects again."""
+    """The far end runs an incarnation that the lab killed. It ends this incarnation, and connects again."""
 
     async def begin() -> None:
         async with stand_in(tmp_path) as (harness, _):
