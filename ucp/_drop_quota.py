@@ -1,8 +1,7 @@
-"""Limit how many bytes the dropped datagrams take in the trace, because any sender can send such datagrams.
-
-A flood of datagrams that are dropped would fill the disk of a vehicle. The agent therefore writes complete datagrams
-only within a quota. It counts the other datagrams and writes their number. The trace therefore contains or counts each
-datagram, and a flood does not make the trace much larger.
+"""Limit the number of bytes that dropped datagrams add to the trace, because any sender can send such datagrams.
+Without a limit, a flood of dropped datagrams would fill the disk of a vehicle. The agent therefore writes complete
+datagrams only within a quota. It counts the other datagrams and writes their number. The trace therefore contains or
+counts each datagram, and a flood does not make the trace much larger.
 """
 
 from collections import Counter

@@ -34,7 +34,7 @@ BLOCK_HEADER = struct_of(BLOCK_FIELDS)
 
 
 def hash_digest(data: bytes) -> bytes:
-    """Return the SHA-256 of the data, which is the protocol's hash function H. It has 32 bytes."""
+    """Return the SHA-256 of the data (32 bytes). SHA-256 is the protocol's hash function H."""
     digest: bytes = sha256(data).digest()
     return digest
 

@@ -170,8 +170,8 @@ def receive_response_next_in_sequence(core: Core, sender: int, message: NextInSe
 
 
 def most_named(candidates: Mapping[bytes, Sequence[int]]) -> list[bytes]:
-    """Return the candidates of phase 2 with the most votes. A tie gives several candidates, and a phase without answers
-    gives none.
+    """Return the candidates of phase 2 with the most votes. The result contains several candidates after a tie, and no
+    candidate after a phase without answers.
     """
     most = max((count for count, _ in candidates.values()), default=0)
     return [candidate for candidate, (count, _) in candidates.items() if count == most]

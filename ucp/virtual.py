@@ -310,7 +310,7 @@ def _store_document(stored: StoredState) -> dict[str, Any]:
 
 
 def _parse_store(value: Any, *, secured: bool) -> StoredState:
-    """Parse stored data, which has the form of the answer to the command `store`. Raises InputError."""
+    """Parse stored data in the form of the answer to the command `store`. Raises InputError."""
 
     def blocks(place: str) -> list[Block]:
         return [

@@ -44,8 +44,8 @@ class RadioRange:
         return replace(change, losses=self._set_losses({}) if change.clears_all else {}, conditions=self._conditions())
 
     def move(self, at_s: float, places: Mapping[int, Place]) -> NetworkChange | None:
-        """Move the vehicles to these positions. Return the resulting change of the network, or None if the network
-        stays the same.
+        """Move the vehicles to these positions. Return the resulting change of the network, or None if this does not
+        change the network.
         """
         if self._radio is None:
             return None

@@ -168,8 +168,8 @@ class ChannelTotals:
 
 
 class BitCounter:
-    """A counter for sets of small numbers. For each number, the counter stores how many of the added sets contain the
-    number. A set is given as an integer with a bit for each member.
+    """A counter for sets of small numbers. For each number, it counts the added sets that contain this number. The
+    caller passes a set as an integer with a bit for each member.
 
     The counts are stored as binary digits. One integer holds the same digit of all counts. A set is added to all counts
     at once by a ripple-carry addition, which takes two steps on average, regardless of the number of counts.

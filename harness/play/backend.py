@@ -70,8 +70,8 @@ class Backend(ABC):
 
 
 def agent_seed(seed: int, agent_id: int, incarnation: int = 1) -> int:
-    """Return the seed for the random events and the deliberate errors of an agent. The agent gets a different seed at
-    each restart.
+    """Return the seed for the random events and the deliberate errors of an agent. The seed is different after each
+    restart of the agent.
     """
     again = f" life {incarnation}" if incarnation > 1 else ""
     return Random(f"{seed}/agent {agent_id}{again}").getrandbits(63)

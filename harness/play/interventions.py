@@ -40,7 +40,7 @@ from harness.scenario.network_states import changed_values
 from harness.scenario.timeline import TimelineEntry
 
 INSTANT_S = 0.001
-"""Mission seconds between two requests of the user that arrive at the same moment."""
+"""Mission seconds between the timeline entries of two requests that arrive at the same moment."""
 
 _NAMED = re.compile(r"(?P<list>timeline|fates)\.(?P<number>\d+)(?P<rest>\.|: )?")
 

@@ -1,7 +1,8 @@
 """Display an active run: mission time, chain lengths and reconciling agents. After the mission, display the progress of
 the checker.
 
-A terminal shows a live table. Other outputs, such as CI logs, get a line every few seconds.
+A terminal shows a live table. If the output is no terminal, for example in CI logs, the display prints a line every few
+seconds.
 """
 
 import time

@@ -66,7 +66,7 @@ class Quirk:
             raise ValueError(f"{self.name} must be a probability 0..1, not {shown(value)}")
 
     def wrong_handler(self, good: EventHandler[Any], value: float, rng: Random) -> EventHandler[Any]:
-        """Return a deliberately wrong handler that replaces `good`. It draws random numbers from `rng`."""
+        """Return a wrong handler that replaces `good`. The wrong handler draws random numbers from `rng`."""
         return replace(
             good,
             run=self._run(good.run, value, rng),

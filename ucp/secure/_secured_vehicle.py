@@ -51,7 +51,7 @@ def agent_factory(
 
 
 def virtual_agent_factory(mission: Mission, bundle: Any, boot: Any) -> Callable[..., SecuredAgent]:
-    """Return a function that creates the agent of a mission in virtual time. It reads no file and no clock.
+    """Return a function that creates the agent of a mission in virtual time. The functions read no file and no clock.
 
     `bundle` is the content of a bundle file. `boot` is the boot of this incarnation in hexadecimal. Raises
     MissionError.

@@ -222,7 +222,7 @@ def _parse_vehicles(document: Any) -> dict[int, bytes]:
 def _can_seal_to(depot: bytes) -> bool:
     """Return whether event data can be sealed to this public key.
 
-    Points of low order give no shared secret (RFC 7748, Section 6.1).
+    This is not possible for points of low order (RFC 7748, Section 6.1).
     """
     try:
         X25519PrivateKey.from_private_bytes(bytes(KEY_BYTES)).exchange(X25519PublicKey.from_public_bytes(depot))

@@ -263,8 +263,8 @@ class Session:
         return decrypted(self._keys_of(clear, now), datagram, clear)
 
     def _accept_boot(self, clear: ClearHeader) -> _SenderIncarnation:
-        """Accept a new start of the sender, which is later than all known ones. Echoes of older challenges no longer
-        count.
+        """Accept a new start of the sender. It must be later than all known starts of this sender. Echoes to earlier
+        challenges no longer count.
         """
         self.challenges.close(clear.sender, self._control)
         incarnation = self._incarnations[clear.sender] = _SenderIncarnation(clear.boot)

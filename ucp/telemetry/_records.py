@@ -75,7 +75,7 @@ class Position(NamedTuple):
 
     @classmethod
     def unpack(cls, data: bytes) -> "Position":
-        """Parse the data of a position event, which are 64 bytes. Raises struct.error for any other length."""
+        """Parse the 64 bytes of data of a position event. Raises struct.error for any other length."""
         return cls._make(_POSITION_DATA.unpack(data))
 
 

@@ -35,9 +35,9 @@ def end_program(init: int, grace_s: float) -> list[str]:
     """End the program that `init`, the first process of a container, started. Return the names of the processes that
     the program left behind.
 
-    The program gets SIGTERM, and SIGKILL after `grace_s` seconds of wall time. If SIGKILL was necessary, the list is
-    empty, because a killed program cannot end its own processes. The container ends when this function returns. Raises
-    OSError if the processes belong to another user or have ended.
+    The function sends SIGTERM to the program, and SIGKILL if the program still runs after `grace_s` seconds of wall
+    time. If SIGKILL was necessary, the list is empty, because a killed program cannot end its own processes. The
+    container ends when this function returns. Raises OSError if the processes belong to another user or have ended.
     """
     with _suspended(init):
         program = int((PROC / f"{init}/task/{init}/children").read_text().split()[0])

@@ -124,9 +124,7 @@ def project_name() -> str:
 
 
 def build_arguments() -> dict[str, str]:
-    """Return the versions of the packages to install in the Docker image. They equal the versions of the packages on
-    this machine.
-    """
+    """Return the versions of the packages to install in the Docker image, which are the versions on this machine."""
     arguments = {"PYMAVLINK": version("pymavlink")}
     with suppress(PackageNotFoundError):  # optional: needed only for secure missions
         arguments["CRYPTOGRAPHY"] = version("cryptography")

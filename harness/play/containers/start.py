@@ -1,7 +1,7 @@
 """Start all agents of a compose file at the same time: `python start.py DIRECTORY`.
 
 The file runs in its own container, so it imports nothing from the project. The mission files in the directory determine
-the agents. When the control sockets of all agents exist, each agent gets the command `start` (see
+the agents. When the control sockets of all agents exist, the program sends each agent the command `start` (see
 ucp/contract/CONTRACT.md).
 """
 

@@ -1,8 +1,8 @@
 """The workers of a Dask cluster that run the agents and the vehicle programs of one run.
 
-The run has a secret of its own. Dask hands it to the workers together with the address at which the harness listens.
-Each worker gets one task, which lasts as long as the run. Dask would start the task of a lost worker again. The harness
-refuses the agents of this second task, because the data of the first agents are lost.
+Each run has a secret of its own. Dask sends this secret to the workers, together with the address at which the harness
+listens. Each worker executes one task, which lasts as long as the run. Dask would start the task of a lost worker
+again. The harness refuses the agents of this second task, because the data of the first agents are lost.
 """
 
 from __future__ import annotations

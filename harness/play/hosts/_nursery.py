@@ -1,7 +1,7 @@
 """Fork the programs of agents and vehicles on a worker from one process that has imported them.
 
 A new interpreter for each agent would spend most of the start on imports. The nursery has one thread and no event loop,
-so a fork of it is safe. It ends with the process that started it, and its children end with it.
+so it can be forked safely. It ends with the process that started it, and its children end with it.
 
 Each vehicle has one network for the whole run, as in a lab. All incarnations of its agent and of its program enter this
 network. An agent therefore reaches its vehicle at the same address as in a lab.

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 def place(agents: Sequence[int], threads: Mapping[str, int]) -> dict[str, list[int]]:
     """Return the agents of each worker. `threads` contains the number of threads of each worker, by the worker's
-    address. Each worker gets agents with consecutive positions in the roster. Workers without agents are omitted.
+    address. The agents of a worker have consecutive positions in the roster. Workers without agents are omitted.
     """
     workers, total = sorted(threads), sum(threads.values())
     placed, before = dict[str, list[int]](), 0

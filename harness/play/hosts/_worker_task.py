@@ -35,8 +35,8 @@ def why_not(programs: list[str], binaries: dict[str, str | None], has_keys: bool
     """Return a sentence if this computer cannot run agents and vehicles, or if one of their programs is missing.
     Otherwise return None.
 
-    `binaries` contains the SHA-256 hashes of the vehicle programs by their paths. If `has_keys` is true, the agents get
-    keys, and this computer must be able to decrypt them.
+    `binaries` contains the SHA-256 hashes of the vehicle programs by their paths. If `has_keys` is true, the harness
+    sends keys to the agents, and this computer must be able to decrypt these keys.
     """
     try:
         far_network.needs_user_namespace()

@@ -56,8 +56,8 @@ def _command(arguments: list[str]) -> list[str]:
 
 
 def _environment() -> dict[str, str]:
-    """Return environment variables for the command inside User Mode Linux. With these variables, it imports the same
-    Python packages as the command outside.
+    """Return environment variables for the command inside User Mode Linux. With these variables, the command inside
+    imports the same Python packages as the command outside.
     """
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
     return {**os.environ, "PYTHONPATH": path}

@@ -245,9 +245,9 @@ class DeliveryLateness:
 class AnswerTimeMeter:
     """A record of the times between the delivery of a query and the agent's answer, in mission seconds.
 
-    In virtual time, an agent answers immediately, and its radio gets the answer after `processing_s`. A real process
-    first waits for a processor. If many agents share few processors, they answer one after another, so fewer answers
-    collide.
+    In virtual time, an agent answers immediately, and passes the answer to its radio after `processing_s`. A real
+    process first waits for a processor. If many agents share few processors, they answer one after another, so fewer
+    answers collide.
     """
 
     def __init__(self) -> None:

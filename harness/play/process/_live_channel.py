@@ -34,7 +34,7 @@ class FrameDelivery(NamedTuple):
 
     at_s: float
     order: int
-    """A number that determines the order of deliveries at the same time."""
+    """A number that determines the order of simultaneous deliveries."""
     vehicle: int
     frame: bytes
 

@@ -121,8 +121,8 @@ class FarEnds:
         """Create the object without listening. `name` describes the run to the user of the other computer.
 
         `places` is the number of incarnations that each far end runs at the same time. `agents` is the number of agents
-        that may join at the same time. If `has_keys` is true, the agents get keys, and only encrypted connections are
-        accepted.
+        that may join at the same time. If `has_keys` is true, the harness sends keys to the agents, and accepts only
+        encrypted connections.
         """
         self._max_handshakes = MAX_HANDSHAKES + agents
         self._host, self._name, self._places, self._has_keys = host, name, places, has_keys

@@ -11,7 +11,9 @@ KILL_LIMIT_S = 3.0
 
 
 class RemoteProgram:
-    """A stand-in as a `LabProgram`. A process cannot catch SIGSTOP and SIGKILL, so the stand-in gets other signals."""
+    """A stand-in as a `LabProgram`. A process cannot catch SIGSTOP and SIGKILL, so this object sends other signals to
+    the stand-in.
+    """
 
     def __init__(self, stand_in: LabProgram, left_behind: Callable[[], Sequence[str]]) -> None:
         """Create the program. `left_behind` returns the names of processes that the agent left on its computer."""

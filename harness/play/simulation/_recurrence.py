@@ -27,8 +27,8 @@ from ucp.agent import ON_TIMER
 from ucp.state import AgentState
 
 CHECK_AFTER_S = 120.0
-"""Mission seconds after which the search for a cycle starts. Most swarms become idle before, which saves the computing
-time of the search.
+"""Mission seconds after which the search for a cycle starts. Most swarms become idle earlier, so the search usually
+takes no computing time.
 """
 SAME_INSTANT_S = 1e-6
 MAX_STEPS = 1000

@@ -103,7 +103,7 @@ class _OpenQuery:
 DueEvent = tuple[int, int, bytes, int | None]
 """An event to log: (incarnation, event ID, data, time in microseconds).
 
-Incarnation 0 stands for the current incarnation. Without a time, the event gets the time of the agent's clock.
+Incarnation 0 stands for the current incarnation. If the time is None, the event has the time of the agent's clock.
 """
 
 

@@ -208,7 +208,7 @@ class LateTimers:
         self._started = 0
 
     def update(self, state: AgentState) -> None:
-        """Update the list of running timers after an input. New timers get numbers in the order of `state.timers`."""
+        """Update the list of running timers after an input. New timers are numbered in the order of `state.timers`."""
         for timer in state.timers:
             known, deadline = self.running.get(timer.name), timer.deadline
             if deadline is None:

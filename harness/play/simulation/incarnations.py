@@ -97,8 +97,8 @@ class SimulatedIncarnation:
 
     @property
     def chain_changed_at(self) -> float | None:
-        """The mission second of the last change of the chain. It is 0 without a change, and None if the time is
-        unknown.
+        """The mission second of the last change of the chain. The value is 0 if the chain never changed, and None if
+        the time is unknown.
         """
         local_s = self.agent.chain_changed_at
         return self.mission_s(local_s) if local_s else local_s

@@ -158,8 +158,8 @@ def _export(simulation: Simulation, files: DiskRecorder) -> None:
 
 
 async def _compare_again(simulation: Simulation, on_progress: Callable[[Simulation], Awaitable[None]]) -> None:
-    """Check that foreign agents are deterministic. Each agent gets its inputs a second time, and its answers are
-    compared with the first answers.
+    """Check that foreign agents are deterministic. Send the inputs of each agent to a program a second time, and
+    compare the answers with the first answers.
     """
     from harness.play.simulation.foreign.determinism import DeterminismCheck, NondeterminismError
 

@@ -33,8 +33,8 @@ class ProgramPool:
         self._lock = Lock()
 
     def take(self, command: Sequence[str], agent_id: int) -> LineProgram:
-        """Return an idle program, or a new program. The caller must give the program back. Raises OSError if a new
-        program cannot be started.
+        """Return an idle program, or a new program. The caller must return the program with `give_back`. Raises OSError
+        if a new program cannot be started.
         """
         log = self._logs / f"{agent_id}.log" if self._logs is not None else None
         with self._lock:

@@ -47,8 +47,7 @@ class DeterminismCheck:
         """Give an agent's recorded inputs to a program with the same command. Raises NondeterminismError if an answer
         differs from the recorded one.
 
-        The first incarnation of each command gets its inputs twice, so that each process runs more than one
-        incarnation.
+        The first incarnation of each command is checked twice, so that each process runs more than one incarnation.
         """
         used = record.command in self._programs
         if not used:

@@ -124,7 +124,7 @@ class LineProgram:
         return line
 
     def _read_rest(self, limit_s: float) -> bytes:
-        """Read a line that arrives in several pieces to its end, and return the whole line."""
+        """Read the rest of a line that arrives in several pieces, and return the whole line."""
         deadline = time.monotonic() + limit_s
         pieces = [self._received]
         length = len(self._received)
