@@ -18,7 +18,7 @@ from harness.checker.uniform_chain import common_prefix
 
 
 def figures(evidence: Evidence) -> dict[str, float | int | None]:
-    """Return the numeric results of a run by name. A result of None is unknown.
+    """Return the numeric results of a run by name. The value of an unknown result is None.
 
     `copies_min` and `copies_mean` are the minimum and the mean number of chains that contain a completed block.
     `uniform_at_s` is the mission second since which all chains are equal, or None if they differ.

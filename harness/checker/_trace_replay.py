@@ -63,8 +63,8 @@ class ReplayedIncarnation:
     """Changes in the trace that are impossible, such as the removal of a block that the agent does not hold."""
     second_copies: list[TraceObservation] = field(default_factory=list)
     idle_too_early: list[TraceObservation] = field(default_factory=list)
-    """Trace lines on which the agent reported to be idle too early: blocks were in its deque or on its stack, or its
-    chain lacked blocks that it had completed.
+    """Trace lines on which the agent claimed to be idle although it was not. Blocks were in its deque or on its stack,
+    or its chain lacked blocks that it had completed.
     """
     wrong_lengths: list[TraceObservation] = field(default_factory=list)
     """The first trace line on which the recorded number of blocks in chain, deque or stack differs from the number that

@@ -32,7 +32,7 @@ RECONCILE_STEPS = frozenset(
     )
 )
 NO_STEP = frozenset(("already in progress", "not in phase 3", "another block"))
-"""Branches (results of a handler) that do not continue the reconcile, although their handlers belong to a reconcile."""
+"""Branches (results) of reconcile handlers that do not count as the next step of a reconcile."""
 
 
 def _continues_reconcile(run: HandlerRun) -> bool:

@@ -150,8 +150,8 @@ class Evidence:
     keys: TrustedKeys | None = None
     """The public keys of a secured mission, which verify the signatures of blocks and exports."""
     verified: "Callable[[UnverifiedSignature], bool] | None" = None
-    """A function that returns true if the signature is already known to be valid, so that the checker need not compute
-    it. Only available for a swarm that this process simulated, otherwise None.
+    """A function that returns true if this process already knows that a signature is valid. The checker then need not
+    verify the signature. None unless this process simulated the swarm.
     """
     watch: Watch | None = None
     """A function that receives each step that the step judge examines."""

@@ -142,7 +142,7 @@ def _count_line(
 
 def _triggered_by(trace: Trace, copies: Mapping[_Key, Any]) -> dict[_Key, list[HandlerRun]]:
     """Return the handler runs that injected messages may have triggered, by message. If an injected copy equals its
-    original, the runs that the original triggered are included.
+    original, the result also contains the handler runs that the original triggered.
     """
     triggered: dict[_Key, list[HandlerRun]] = defaultdict(list)
     for run in trace.runs:

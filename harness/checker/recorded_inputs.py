@@ -22,7 +22,9 @@ from ucp.messages import BlockResponse, CommitBlock, Datagram, MalformedDatagram
 from ucp.trace import HandlerRun, RecordedBytes, SentMessage
 
 KEPT = 4096
-"""Number of decoded datagrams in the cache. Many agents receive the same datagram."""
+"""Maximum number of decoded datagrams in the cache. The cache saves time, because many agents receive the same
+datagram.
+"""
 
 LENGTH_BYTES = 2
 

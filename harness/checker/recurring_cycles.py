@@ -240,7 +240,7 @@ def _each_other(peers: Mapping[int, tuple[int, ...]]) -> bool:
 
 
 def _alike(peers: Mapping[int, tuple[int, ...]]) -> Iterator[tuple[tuple[int, ...], list[int]]]:
-    """Yield each distinct set of peers, together with the agents that have this set."""
+    """Yield each distinct set of peers, together with the agents that wait for this set."""
     alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
     for agent_id, whom in peers.items():
         alike[whom].append(agent_id)

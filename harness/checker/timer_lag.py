@@ -19,7 +19,7 @@ class TimerLag:
     late_s: float
     """Lateness in mission seconds that 19 of 20 vote timers did not exceed."""
     asked_s: float
-    """Requested duration of a vote timer in mission seconds."""
+    """Duration of a vote timer according to the settings, in mission seconds."""
 
     @property
     def tolerable(self) -> bool:

@@ -79,8 +79,8 @@ PLAYED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a proof: `most_bytes` of memory for all processes together, `most_s` seconds, and `cores` worker
-    processes.
+    """The limits of a proof: `most_bytes` is the memory of all processes together in bytes, `most_s` is the time in
+    seconds, and `cores` is the number of worker processes.
     """
 
     most_bytes: float = 4e9
@@ -166,8 +166,9 @@ class Proof:
     def left_open(self) -> bool:
         """True if the proof cannot decide whether every state has a path to one chain.
 
-        With the option `zones_contained`, a state also represents states with fewer possible timer values. If such a
-        state seems to have no path to one chain, these other states may be the only reason.
+        This happens only with the option `zones_contained`, with which a state also represents states with fewer
+        possible timer values. If no path to one chain is found for such a state, the reason may be one of the
+        represented states and not the state itself.
         """
         return self.bounds.zones_contained and self.liveness is not None and self.liveness.lost is not None
 

@@ -144,7 +144,7 @@ class RunDifference:
     """All differences between two runs."""
 
     keys: list[KeyDifference]
-    """The keys of the scenario with different values. The seed of the run counts as the key `seed`."""
+    """The scenario keys whose values differ between the two runs. The seed of the run counts as the key `seed`."""
     programs: dict[Literal["a", "b"], list[AgentProgram]]
     """The programs of the agents in each run. The list of a run is empty if all agents ran the harness's own program.
     """
@@ -161,8 +161,8 @@ class RunDifference:
 
     @property
     def first(self) -> int | None:
-        """The agent whose first difference has the earliest mission time. If this is true for several agents, the value
-        is the lowest ID. It is None if there are no differences.
+        """The agent whose first difference has the earliest mission time. Of several such agents, it is the one with
+        the lowest ID. None if there are no differences.
         """
         at_s = {
             agent_id: difference.run.at_s for agent_id, difference in self.agents.items() if difference.run is not None

@@ -298,8 +298,8 @@ def _multiples(every: float, low: float, high: float) -> list[float]:
 
 
 def thin(lines: Sequence[Sequence[Point]], most: int) -> list[list[Point]]:
-    """Remove points from the lines. A deviation of half a pixel is allowed. If more than `most` points remain, a larger
-    deviation is allowed. Each line keeps its first and last point.
+    """Remove points from the lines. A simplified line deviates by at most half a pixel from the original line. If more
+    than `most` points remain, a larger deviation is allowed. Each line keeps its first and last point.
     """
     tolerance, thin = INVISIBLE_PX, [simplify(line, INVISIBLE_PX) for line in lines]
     while sum(map(len, thin)) > max(most, 2 * len(lines)):

@@ -57,7 +57,7 @@ def tags(
 
 
 def _boxes(digits: int, place: Point) -> list[Box]:
-    """Return the rectangles in which a tag beside a place could be drawn. The best rectangle is first."""
+    """Return the possible rectangles for a tag beside a place on the map. The best rectangle is first."""
     width = digits * DIGIT + PADDING
     boxes = []
     for distance in (NEAR, FAR):

@@ -71,9 +71,7 @@ class RecordComparisons:
     """Agent -> number of messages that the agent could not send, according to the agent's own count."""
 
     def touching(self, number: str) -> list[Finding]:
-        """Return the contradictions between records from which the checker derives the characteristic with this
-        number.
-        """
+        """Return the contradictions between records that decide the verdict on the characteristic with this number."""
         return [contradiction.finding for contradiction in self.contradictions if contradiction.touches == number]
 
 

@@ -31,7 +31,7 @@ records tenths of a second.
 def compare(evidence: Evidence) -> Iterator[Contradiction]:
     """Yield each impossible time:
 
-    - an export or a handler run that is later than the end of the run allows
+    - an export or a handler run that is too late after the end of the run
     - an export before the end of the agent
     - an event whose timestamp differs from the time at which the agent logged it
     """

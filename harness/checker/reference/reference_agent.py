@@ -19,7 +19,7 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 
 
 class StoredBlocks(Protocol):
-    """The blocks that an agent stored on disk, and the hashes of the blocks that it completed."""
+    """The blocks that an agent stored on disk, and the hashes of the blocks that the agent completed."""
 
     @property
     def completed(self) -> Sequence[bytes]: ...

@@ -19,9 +19,9 @@ from harness.checker.steps.follower import RecordedTimerExpiry
 from harness.checker.steps.trace_header import ROUNDING_S
 
 SINGLE_WALL_S = 0.03
-"""Maximum lateness of a single timer, in seconds of wall time, that needs no explanation."""
+"""Maximum lateness of a single timer in addition to the measured delay, in seconds of wall time."""
 MEAN_WALL_S = 0.01
-"""Maximum mean lateness of one timer's expiries, in seconds of wall time, that needs no explanation."""
+"""Maximum mean lateness of one timer's expiries in addition to the mean measured delay, in seconds of wall time."""
 ENOUGH = 8
 """Minimum number of expiries for which a mean is computed."""
 

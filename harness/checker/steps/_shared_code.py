@@ -35,8 +35,8 @@ NAME_A_BLOCK = ("block_hash", "block")
 """Fields of a message that name a block."""
 VECTORS = Path(ucp.__file__).parent / "contract" / "vectors"
 OF_THE_ROSTER = ("own sender", "sender not on the roster", "block not of the roster")
-"""Reasons for which an agent drops a datagram that the codec accepts. The codec does not know the roster, the list of
-all agents.
+"""Reasons for which an agent drops a datagram that the codec accepts. The codec cannot detect them, because it does not
+know the roster, the list of all agents.
 """
 
 
@@ -164,7 +164,7 @@ def _missions() -> Iterator[str]:
 
 
 def _is_read(run: HandlerRun, recorded: dict[str, Any]) -> bool:
-    """Return true if the handler run, which was read from a trace line, contains the values of this line."""
+    """Return true if a handler run contains the values of the trace line from which it was read."""
     trigger: dict[str, Any] = recorded["trigger"]
     kind = next(iter(trigger))
     if (run.trigger.kind, run.trigger.subject) != (kind, trigger[kind]):

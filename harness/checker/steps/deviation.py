@@ -102,7 +102,9 @@ def _message(message: SentMessage, others: Sequence[SentMessage], name: NameOf) 
 
 
 def _content(message: SentMessage, other: SentMessage) -> str:
-    """Return the content of `message` that differs from `other`, a message of the same type about the same block."""
+    """Return the parts of the content of `message` that differ from `other`, a message of the same type about the same
+    block.
+    """
     try:
         content = decoded(message.datagram).message
     except MalformedDatagramError as malformed:

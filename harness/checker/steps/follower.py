@@ -51,8 +51,8 @@ machine was busy.
 
 
 class NotHandledError(Exception):
-    """An error: the protocol does not run this handler at this moment. The message has no subject. The caller puts "it"
-    before it.
+    """An error: the protocol does not run this handler at this moment. The message is the end of a sentence that begins
+    with "it".
     """
 
 

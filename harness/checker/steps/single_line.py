@@ -440,7 +440,9 @@ def _senders(runs: Iterable[HandlerRun]) -> set[int]:
 
 
 def _assignments(choices: Sequence[Sequence[int]]) -> Iterator[tuple[int, ...]]:
-    """Yield all tuples that contain one element of each sequence, without a repeated element."""
+    """Yield all ways to choose one element from each sequence, such that no element is chosen twice. Each result is a
+    tuple.
+    """
     if not choices:
         yield ()
         return

@@ -141,9 +141,8 @@ class StateStore(Sequence[State]):
 
 
 class SuccessorStore(Sequence[ByTimer]):
-    """The successors of each state, grouped by the timer that expires.
-
-    One flat array contains all groups. Each group consists of the number of its successors and the successors.
+    """The successors of each state, grouped by the timer that expires. One flat array contains all groups. For each
+    group, the array contains the number of successors and then the successors.
     """
 
     def __init__(self) -> None:

@@ -231,8 +231,8 @@ class ModelSwarm:
         return self.coincidences(state, actions) <= state[LEFT] % LOSSES // COINCIDENCES
 
     def coincidences(self, state: State, actions: Sequence[AgentAction]) -> int:
-        """Return the number of coincidences that these simultaneous actions need. A coincidence is an event that
-        happens by chance at the same moment as an independent one.
+        """Return the number of coincidences that these simultaneous actions need. In a coincidence, two independent
+        events happen at the same moment by chance.
         """
         if self.bounds.timers_any:
             return 0
@@ -302,8 +302,8 @@ class ModelSwarm:
         return ANY_NUMBER if self.bounds.losses is None else state[LEFT] // LOSSES
 
     def _can_be(self, state: State, instant: _InstantResults) -> bool:
-        """Return true if these timers can expire together and before all other timers. Each of these timers alone must
-        be able to expire first.
+        """Return true if these timers can expire together and before all other timers. Call this method only if each of
+        the timers alone can expire first.
         """
         if len(instant.ended) < 2 or self.bounds.timers_any:
             return True

@@ -36,7 +36,7 @@ message.
 
 
 class HeldBlockOrder:
-    """The chain of an agent, and all blocks that it holds in the order of their ages. The object is immutable."""
+    """The chain of an agent, and all blocks that the agent holds, sorted by age. The object is immutable."""
 
     __slots__ = ("_blocks", "_heights", "_numbers", "_ordinals", "_shape", "_top")
 

@@ -18,8 +18,8 @@ from ucp.clock import MICROSECONDS
 
 MEGABYTE = 1e6
 AS_PRINTED = {"change_without_new_vote": 5, "stop_after_stack": 16}
-"""The two deliberate mistakes (quirks) that the specification also supports. At these places, the printed algorithms of
-the thesis contradict the text of the thesis.
+"""The two deliberate mistakes (quirks) that the specification also supports. With these quirks, an agent follows the
+printed algorithms of the thesis at two places where they contradict the text of the thesis.
 """
 INVARIANTS = {"Characteristic2": "2", "Characteristic3": "3", "Characteristic4": "4", "NobodyHangs": "hang"}
 """Name of an invariant in the specification -> key of the violation that `prove` reports."""

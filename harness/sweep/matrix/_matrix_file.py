@@ -22,8 +22,8 @@ from ucp.short_value import shown
 MAX_SEEDS = 10_000
 MAX_SEED = 2**32 - 1
 SIZES_FOR_GROWTH = 3
-"""Minimum number of swarm sizes or mission lengths for which power laws are fitted. Any power law would fit
-two points.
+"""Minimum number of swarm sizes or mission lengths for which power laws are fitted. With only two of them, a power law
+would always fit.
 """
 
 
@@ -82,8 +82,8 @@ class Matrix(StrictModel):
     backend: Annotated[list[BackendName], Field(min_length=1, default_factory=lambda: ["sim"])]
     """Backends, by default `sim`."""
     keep: Literal["violated", "all"] = "violated"
-    """Run directories to keep: those of runs with a violation or failure, or those of all runs. Only runs that are not
-    played in memory have a directory.
+    """The run directories that are kept: those of runs with a violation or failure, or those of all runs. Simulated
+    runs in memory have no directory.
     """
     traces: bool = True
     """True if agents write traces in virtual time. Without traces, a run of a large swarm takes a fifth of the time and

@@ -57,8 +57,8 @@ CHANGED = frozenset(
         "name",
     )
 )
-"""Scenario keys in which a stored run may differ from the scenario of the directory. None of these keys affects this
-machine.
+"""Scenario keys in which a stored run may differ from the scenario of the directory. The other keys must not differ,
+because some of them affect this machine. For example, they can choose the program of an agent.
 """
 LONGEST_S = 3600.0
 _NAME = re.compile(r"[0-9a-f]{12}-seed-(\d{1,10})\.yaml")

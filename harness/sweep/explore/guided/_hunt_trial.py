@@ -239,8 +239,8 @@ def findings_of(scenario: Scenario, seed: int) -> tuple[FindingIdentity, ...]:
 
 
 def with_liveness_phase(document: Document) -> Document:
-    """Return the document with additional timeline entries. They remove all network conditions at the end of the
-    mission, so that the swarm can become idle.
+    """Return the document with additional timeline entries, which remove all network conditions at the end of the
+    mission. The swarm can then become idle.
     """
     ends_s = float(document.get("duration_s", 1200.0))
     fates = [_ending_at(fate, ends_s) for fate in document.get("fates", []) if fate.get("from_s", 0.0) < ends_s]
