@@ -1,4 +1,4 @@
-"""Imitate two computers for tests by two network namespaces with a veth pair between them.
+"""Imitate two computers for tests. Each computer is a network namespace, and a veth pair connects both.
 
 The lab's computer has the address 192.168.7.1, and the far one 192.168.7.2. `cut`, `reset` and `lose` disturb the cable
 between them with nftables.

@@ -38,7 +38,9 @@ LAST_SEQUENCE = 2**32 - 1
 REVOCATION = 10
 """Type of a revocation datagram. The authority signs its body."""
 CHALLENGE, ECHO = 11, 12
-"""Types of the datagrams with which a sender proves that it is active now. `ucp.secure._challenges` explains them."""
+"""Types of the datagrams with which a receiver finds out whether a sender is active now. `ucp.secure._challenges`
+explains them.
+"""
 CONTROL_POSITION = 2**32
 """Smallest nonce position of a control datagram. Control datagrams have types from 10 on, and contain no message of the
 protocol. Messages have smaller positions.

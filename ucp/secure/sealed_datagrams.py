@@ -104,7 +104,7 @@ class Signer(Protocol):
 class CryptoFunctions:
     """The cryptographic functions that a session calls. Their results depend only on bytes and keys.
 
-    The defaults compute each result. A simulation replaces them by functions with the same arguments that cache
+    The defaults compute each result. A simulation replaces them by functions that have the same arguments and cache the
     results.
     """
 

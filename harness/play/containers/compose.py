@@ -82,7 +82,8 @@ def write_compose(
 
 def _keys(scenario: Scenario) -> MissionKeys | None:
     """Return the mission keys from the user's key directory. Return None for a mission without keys. Raises
-    ScenarioError if the scenario names no such directory, because the compose file contains no keys.
+    ScenarioError if the scenario names no such directory, or if a key file is missing, because the compose file
+    contains no keys.
     """
     if scenario.security is None:
         return None

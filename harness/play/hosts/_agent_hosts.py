@@ -192,9 +192,7 @@ class AgentHosts:
         raise MachineError(self._problem.result())
 
     async def _end(self) -> None:
-        """Wait until the workers have ended their agents. The workers end them as soon as the harness no longer
-        listens.
-        """
+        """Wait until the workers have ended their agents. A worker ends its agents when the harness stops listening."""
         for connection in self._connections.values():
             if connection.done():
                 connection.result().close()

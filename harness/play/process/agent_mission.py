@@ -12,8 +12,8 @@ from ucp.messages import PORT
 from ucp.mission import SCHEMA
 
 NO_QUIRKS = {"ignore_commit": 0.0, "crash_on_tie": False, "early_phase3_expiry": False, "stale_chain_hash": False}
-"""The quirks (deliberate errors for tests of the checker) that every mission file lists, switched off. Other quirks are
-listed only if the scenario requests them.
+"""The quirks (deliberate errors for tests of the checker) that every mission file lists. They are switched off. Other
+quirks are listed only if the scenario requests them.
 """
 
 

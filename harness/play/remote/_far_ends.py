@@ -163,8 +163,8 @@ class FarEnds:
             path.unlink(missing_ok=True)
 
     async def stop_listening(self) -> None:
-        """Close the listening sockets. If a far end then fails to connect again, it knows that no other incarnation of
-        its agent follows.
+        """Close the listening sockets. A far end that cannot connect again concludes that no other incarnation of its
+        agent follows.
         """
         for task in self._accepting.values():
             task.cancel()

@@ -228,8 +228,8 @@ def hand_over(inside: socket.socket, connection: socket.socket, state: dict[str,
 
 
 def take_over(outside: socket.socket) -> tuple[socket.socket, dict[str, Any]] | None:
-    """Return the connected socket and the state of its channel that the process outside has sent. Return None if that
-    process has ended. Raises BlockingIOError if no socket has arrived.
+    """Receive a connected socket and the state of its channel from the process outside, and return them. Return None if
+    that process has ended. Raises BlockingIOError if no socket has arrived.
     """
     data, descriptors, _, _ = socket.recv_fds(outside, HANDED_OVER_BYTES, 1)
     if not data:

@@ -42,8 +42,8 @@ def test_stagger_ends_the_livelock_of_agents_in_step() -> None:
 
 
 def test_two_losses_livelock_a_staggered_swarm() -> None:
-    """The scenario loses two messages. If only one of them is lost, or with equal timers or a majority in phase 2, the
-    agents do not repeat a cycle.
+    """The scenario loses two messages. The agents do not repeat a cycle if only one of these messages is lost, if all
+    timers are equal, or with the setting `top_needs_majority`.
     """
     scenario = load_scenario(SCENARIOS / "two_losses.yaml")
     first, second = scenario.fates

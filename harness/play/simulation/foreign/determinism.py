@@ -65,7 +65,8 @@ class DeterminismCheck:
 def _error_message(record: IncarnationRecord, difference: str, *, used: bool) -> str:
     """Return an error message that includes the probable cause.
 
-    Two new processes show whether an earlier incarnation in the same process causes the difference.
+    The function starts two new processes to find out whether an earlier incarnation in the same process causes the
+    difference.
     """
     sentence = f"is not deterministic: {difference}"
     if not used and not record.after_another:
