@@ -1,7 +1,7 @@
 """Encode and decode netlink attributes (RFC 3549; linux/netlink.h).
 
-The package has its own small codec for speed. A lab of 100 vehicles with different conditions for each pair of vehicles
-sends 20,000 requests to set the conditions. It then reads 10,000 answers to check them.
+The package has its own small codec for speed. For example, a lab of 100 vehicles with different conditions for each
+pair of vehicles sends 20,000 requests to set the conditions, and then reads 10,000 answers to check them.
 """
 
 from __future__ import annotations

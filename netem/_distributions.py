@@ -12,8 +12,8 @@ from statistics import NormalDist
 from netem.link import Distribution
 
 SCALE = 8192
-"""Unit of a table entry. In the uniform distribution, an entry of SCALE stands for the largest deviation from the mean.
-In the other distributions, it stands for one standard deviation above the mean.
+"""Unit of a table entry. In the uniform distribution, an entry of SCALE means the largest deviation from the mean. In
+the other distributions, it means one standard deviation above the mean.
 """
 
 

@@ -87,7 +87,9 @@ class VirtualSwitch:
         )
 
     def _wait_for_carrier(self) -> None:
-        """Wait until the bridge forwards packets on each port. The kernel takes a short time to detect a new cable."""
+        """Wait until the bridge forwards packets on each port. After a cable is plugged in, the kernel needs a short
+        time to detect it.
+        """
         deadline = time.monotonic() + _CARRIER_DEADLINE_S
         while True:
             ready = forwarding(self.netlink)

@@ -114,7 +114,7 @@ class NftablesEngine(Engine):
         return commands
 
     def _loss(self, conditions: NetworkConditions) -> list[list[dict[str, Any]]]:
-        """Return the nftables commands that set the loss for each receiver."""
+        """Return the nftables commands that set the loss rates of all receivers."""
         differing: dict[int, dict[float, list[int]]] = {}
         for sender, receiver, link in conditions.differing_links():
             differing.setdefault(receiver, {}).setdefault(link.independent_loss, []).append(sender)

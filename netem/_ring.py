@@ -69,7 +69,7 @@ class CaptureRing:
         self._socket.bind((port, _ETH_P_ALL))
 
     def fileno(self) -> int:
-        """Return a file descriptor. It becomes readable when a block of frames is available."""
+        """Return a file descriptor that becomes readable when a block of frames is available."""
         return self._socket.fileno()
 
     def take(self) -> Iterator[tuple[int, bytes, bool]]:
@@ -104,7 +104,9 @@ class CaptureRing:
         self._socket.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", len(nothing), address))
 
     def count(self) -> int:
-        """Update the counters from the kernel. Return the number of frames that `take` can still yield."""
+        """Read the counters of the kernel, and update the attributes. Return the number of frames that `take` can still
+        yield.
+        """
         counts = self._socket.getsockopt(_SOL_PACKET, _STATISTICS, _COUNTS.size)
         received, dropped, _ = _COUNTS.unpack(counts)  # since the last call
         self.received += received
@@ -113,7 +115,7 @@ class CaptureRing:
 
 
 def _with_checksum(frame: bytes, start: int, at: int) -> bytes:
-    """Compute a checksum in place of the network hardware, and write it into the frame. The checksum covers the bytes
-    from offset `start` on. The kernel has already written the sum of the pseudo-header into the checksum field.
+    """Return the frame with a checksum. Normally the network hardware computes this checksum. The checksum covers the
+    bytes from offset `start` on. The kernel has already written the sum of the pseudo-header into the checksum field.
     """
     return frame[:at] + checksum(frame[start:]).to_bytes(2, "big") + frame[at + 2 :]

@@ -136,8 +136,8 @@ class Engine(ABC):
         """Change the network conditions. Return the state that the kernel reports afterwards.
 
         Raises ConditionsError for an unknown vehicle. Raises EngineError if the engine does not support the conditions,
-        if the kernel refuses them, or if its state differs from them. In these cases the previous conditions are
-        restored, or the error names the conditions in effect.
+        if the kernel refuses them, or if the state of the kernel differs from them. In these cases the previous
+        conditions are restored, or the error names the conditions that now apply.
         """
         conditions.validate(self._vehicles)
         if not self.has_queues and (needs := conditions.needs()):

@@ -159,8 +159,8 @@ def waiting_when_lost(received: ReceivedStream, delay_s: float) -> Estimate:
 
 
 def share(hits: int, count: int, worth: float = 1.0) -> Estimate:
-    """Estimate the probability of an event that occurred in `hits` of `count` draws (Wilson, 1927). Each draw counts as
-    `worth` independent draws.
+    """Estimate the probability of an event that occurred in `hits` of `count` draws (Wilson, 1927). `worth` is the
+    number of independent draws to which one draw is equivalent. It is below 1 if the draws are correlated.
     """
     if count == 0:
         return _NOTHING
@@ -197,8 +197,8 @@ def _losses(received: ReceivedStream) -> list[bool]:
 
 
 def _independence(losses: Sequence[bool]) -> float:
-    """Return the number of independent draws that one draw counts as, because losses in bursts are correlated. It is (1
-    - c) / (1 + c), where c is the correlation of successive losses in this sequence.
+    """Return the number of independent draws to which one draw of this sequence is equivalent. It is below 1 for losses
+    in bursts, because they are correlated. It is (1 - c) / (1 + c), where c is the correlation of successive losses.
     """
     loss = fmean(losses)
     if not 0 < loss < 1:

@@ -25,8 +25,8 @@ def fork_program(
     """Call `main` in a new process, and return the ID of this process.
 
     The new process has its own session, the default signal handlers and an empty standard input. `files` are its
-    standard output and standard error. It has no other open files. It calls `prepare` before `main`. The calling
-    process must have one thread.
+    standard output and standard error. No other files are open in the new process. The new process calls `prepare`
+    before `main`. The calling process must have one thread.
     """
     sys.stdout.flush()
     sys.stderr.flush()

@@ -49,8 +49,8 @@ _FIRST_FREE = 4
 
 @dataclass(frozen=True)
 class MeasuredQuantity:
-    """A comparison to make. `estimate` computes a value from the packets between two vehicles. This value should equal
-    the requested value `asked`.
+    """A comparison to make. `estimate` computes a value from the packets between two vehicles. The comparison is right
+    if this value equals the requested value `asked`.
     """
 
     sender: int

@@ -139,9 +139,7 @@ class _SenderLinks(Protocol):
     soonest_of_all: float
     latest: float
     certain: bool
-    """True if no random number matters: each receiver certainly gets one copy of each broadcast, or certainly gets
-    none.
-    """
+    """True if random numbers have no effect, because each receiver receives each broadcast exactly once, or never."""
 
     def draw(self, now: float, data_bytes: int) -> RandomDraws: ...
 

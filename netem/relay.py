@@ -70,7 +70,7 @@ class ReceivedBroadcast:
     vehicle: int
     at_ns: int
     frame: bytes
-    """The Ethernet frame. It follows a `virtio_net_hdr`, which the kernel adds."""
+    """The Ethernet frame, after a `virtio_net_hdr` that the kernel puts before it."""
 
     def udp_data(self, port: int) -> bytes | None:
         """Return the data of an unfragmented IPv4 UDP datagram to this port. Return None for any other frame."""
@@ -164,7 +164,9 @@ class Relay:
 
 
 def _socket(protocol: int) -> socket.socket:
-    """Return a packet socket that receives frames of this Ethernet protocol. It receives none if the protocol is 0."""
+    """Return a packet socket that receives frames of this Ethernet protocol. If the protocol is 0, the socket only
+    sends.
+    """
     packets = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(protocol))
     packets.setsockopt(_SOL_PACKET, _VNET_HDR, 1)
     return packets

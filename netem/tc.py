@@ -67,8 +67,8 @@ class _RemovedClassTotals:
 
 @dataclass
 class _ClassState:
-    """The network conditions that the engine last set for a traffic class. They are None if the kernel refused them.
-    `distribution` is the distribution of the delay.
+    """The state of a traffic class. `link` contains the network conditions that the engine last set for the class, or
+    None if the kernel refused them. `distribution` is the distribution of the delay.
     """
 
     link: LinkConditions | None

@@ -289,7 +289,9 @@ def _exit_status(received: bytes) -> int | None:
 
 @contextlib.contextmanager
 def _forwarding_interrupts(guest: _RunningKernel) -> Iterator[None]:
-    """Forward Ctrl-C and SIGTERM to the virtual machine as a typed Ctrl-C. This works only in the main thread."""
+    """Forward Ctrl-C and SIGTERM to the virtual machine: each of them arrives there as a typed Ctrl-C. This works only
+    in the main thread.
+    """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if not guest.up:

@@ -217,8 +217,8 @@ class Autopilot:
         return ACCEPTED
 
     def load(self, mission: Sequence[Any]) -> None:
-        """Replace the mission. If a mission is in progress, the vehicle continues with the item of the same number in
-        the new mission.
+        """Replace the mission. If a mission is in progress, the vehicle continues with the item that has the number of
+        the current item in the new mission.
         """
         self.mission = mission
         if not self._in_mission:

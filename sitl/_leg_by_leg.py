@@ -17,9 +17,9 @@ FAST = 4.0  # limit of a vehicle's speed as a multiple of the commanded one
 def leg_by_leg(
     waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: MotionState
 ) -> tuple[list[MotionSegment], MotionSegment]:
-    """Return the segments up to the last completed waypoint, and the segment after them. The segment after them is the
-    motion of a vehicle that receives no further commands. If a waypoint takes longer than the pilot's time limit, the
-    waypoint is not completed, and the pilot sends no further commands.
+    """Return the segments up to the last completed waypoint, and one further segment. The further segment is the motion
+    of a vehicle that receives no more commands. If a waypoint takes longer than the pilot's time limit, the waypoint is
+    not completed, and the pilot sends no more commands.
     """
     model, motion, goal = AT_ONCE[vehicle_type], start, None
     flown: list[MotionSegment] = []

@@ -14,9 +14,8 @@ class FrameSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Add bytes, and return the frames that these bytes complete.
-
-        The splitter stores less than one frame, which has at most 292 bytes.
+        """Add bytes to the stream. Return the frames that are now complete. The splitter stores less than one frame,
+        which has at most 292 bytes.
         """
         stream, at, frames = self._rest + data, 0, []
         while len(stream) - at >= _HEADER_BYTES:

@@ -56,7 +56,9 @@ ROLL_OUT_ACCEL_MS2 = LANDING_MS**2 / (2 * (ROLL_OUT_M + PAST_M))
 
 
 class PlaneMotion:
-    """The motion of a plane. It passes the places of a plan, and flies circles where it must stay."""
+    """The motion of a plane. The plane flies past the places of a plan. If it must stay at a place, it flies
+    circles.
+    """
 
     cruise_ms = CRUISE_MS
 
@@ -161,10 +163,9 @@ class _PlanePath:
         self._add(CircularArc(self._end, centre, turn_rad, self.speed_ms))
 
     def fly_by(self, place: LocalPlace, reached_m: float, rather_left_m: float = 0.0) -> None:
-        """Turn towards `place`, and fly straight until the distance to `place` is `reached_m`.
-
-        The plane takes the shorter path of a left turn and a right turn. It turns right only if this path is shorter by
-        more than `rather_left_m`.
+        """Turn towards `place`, and fly straight until the distance to `place` is `reached_m`. The plane turns left or
+        right, whichever path is shorter. It turns right only if the path with the right turn is shorter by more than
+        `rather_left_m`.
         """
         here = self._end
         if math.dist(here.point[:2], place[:2]) <= max(reached_m, NEAR_M):

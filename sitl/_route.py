@@ -87,8 +87,8 @@ def is_near(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) ->
 
 
 def to_go_m(place: LocalPlace, waypoint: Waypoint, vehicle_type: VehicleType) -> float:
-    """Return the distance over the ground in metres until the waypoint counts as reached. The result is negative if it
-    already counts as reached.
+    """Return the distance over the ground in metres until the vehicle has reached the waypoint. The result is negative
+    if the vehicle has already reached the waypoint.
     """
     return math.dist(place[:2], waypoint.place[:2]) - NEAR_M[vehicle_type]
 

@@ -183,8 +183,8 @@ class ArduPilot:
             raise NoProgramError(f"no {self.setup.debugger} is on PATH: install it, or leave out `debugger`")
 
     def _check_model(self, frame: str) -> None:
-        """Raise VehicleError if the binary does not offer the frame. An older binary lacks some frames. If it were
-        started with such a frame, it would simulate another frame whose name has the same beginning.
+        """Raise VehicleError if the binary does not offer the frame. An older binary lacks some frames. If the user
+        requested such a frame, the binary would simulate another frame whose name has the same beginning.
         """
         offered = models(self.binary)
         words = self.frame.lower().split("-")

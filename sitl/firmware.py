@@ -91,7 +91,7 @@ class InstallWatcher(Protocol):
         """Report that the installation waits, because another process is installing a binary for this vehicle."""
 
     def downloads(self, done: int, total: int) -> None:
-        """Report the number of bytes of the binary that were downloaded, and its size."""
+        """Report the progress of the download: the number of downloaded bytes, and the size of the binary."""
 
 
 @dataclass(frozen=True)

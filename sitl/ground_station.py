@@ -69,9 +69,8 @@ class GroundStation(asyncio.DatagramProtocol):
         return station
 
     async def attach(self, vehicle_id: int, sysid: int, sock: socket.socket) -> None:
-        """Take over the socket `sock`, which is connected to the vehicle's port for ground stations.
-
-        It replaces an earlier connection.
+        """Use `sock` as the connection to the vehicle's port for ground stations. An earlier connection to the vehicle
+        is closed.
         """
         sock.setblocking(False)
         vehicle = _VehicleConnection(vehicle_id, lambda frames: self._forward(sysid, frames))
@@ -162,7 +161,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self._full = False
 
     def error_received(self, exc: Exception) -> None:
-        """Ignore the error. It means that no program listens at the address of the ground station at the moment."""
+        """Ignore the error, which means that no program listens at the address of the ground station at the moment."""
 
 
 class _VehicleConnection(asyncio.Protocol):

@@ -136,7 +136,7 @@ class Pilot:
         return values
 
     def shortfall(self, flight: PilotProcedure) -> str | None:
-        """Return an error sentence if the vehicle should have left its home position but is still there. Otherwise
+        """If the vehicle should have left its home position but is still at home, return an error sentence. Otherwise
         return None.
         """
         if self.state.has_moved or self._terminated or self._handed_over or self._befallen:

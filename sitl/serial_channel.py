@@ -177,7 +177,7 @@ class ClientChannel:
             vehicle.go_to(vehicle.place(message.coordinate_frame, message.lat_int, message.lon_int, message.alt))
 
     def _set_parameter(self, message: Any) -> None:
-        """Set a parameter. An unknown parameter gets no answer, as in ArduPilot."""
+        """Set a parameter. If the parameter is unknown, send no answer, as ArduPilot does."""
         vehicle, name, value = self._autopilot, message.param_id, message.param_value
         if name == TAKE_OFF_ALTITUDE and vehicle.vehicle_type == "plane":
             if 0 < value <= MAX_ALTITUDE_M:

@@ -8,9 +8,11 @@ from sitl.vehicle import MAX_SYSID
 
 
 def system_ids(vehicle_ids: Sequence[int]) -> dict[int, int]:
-    """Return a MAVLink system ID, 1 to 255, for each vehicle. It is the ID of the vehicle if possible, otherwise a free
-    ID. With more than 255 vehicles, some vehicles have the same system ID. This has no effect, because each vehicle is
-    alone in its network namespace.
+    """Return a MAVLink system ID, 1 to 255, for each vehicle.
+
+    If the ID of the vehicle is at most 255, it is also the system ID. Other vehicles receive free system IDs. With more
+    than 255 vehicles, some vehicles have the same system ID. This has no effect, because each vehicle is alone in its
+    network namespace.
     """
     taken = {vehicle_id for vehicle_id in vehicle_ids if vehicle_id <= MAX_SYSID}
     free = [sysid for sysid in range(1, MAX_SYSID + 1) if sysid not in taken] or [MAX_SYSID]

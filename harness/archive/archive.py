@@ -124,7 +124,7 @@ class RunArchive:
 
     @property
     def judged_record(self) -> JudgedRecord | None:
-        """The part of run.json that the checker needs. It is None if any key of this part is missing or damaged."""
+        """The part of run.json that the checker needs. None if any key of this part is missing or damaged."""
         return self._record_file.judged if self._record_file else None
 
     @property

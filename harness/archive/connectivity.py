@@ -323,7 +323,7 @@ def _toggle(times: dict[Key, list[float]], keys: Iterable[Key], at_s: float) -> 
 
 
 def _is_on(times: Sequence[float], at_s: float) -> bool:
-    """Return true if a condition is on at mission second `at_s`. At first, the condition is off. It switches on at the
-    first of `times`, off at the second, and so on.
+    """Return true if a condition is on at mission second `at_s`. Before the first of `times`, the condition is off. It
+    switches on at the first of `times`, off at the second, and so on.
     """
     return bisect_right(times, at_s) % 2 == 1

@@ -273,10 +273,9 @@ class HistoryReader:
 
 
 def _messages(traces: Mapping[int, Trace]) -> list[BroadcastMessage]:
-    """Return all messages with their receivers.
-
-    Sequence numbers begin again with each incarnation. A receipt therefore belongs to the latest earlier message with
-    its sequence number.
+    """Return all messages with their receivers. After a restart, an agent uses sequence numbers again. If several
+    messages of a sender have the same sequence number, a reception therefore belongs to the last one that was sent
+    before it.
     """
     sent: dict[tuple[object, object], list[BroadcastMessage]] = defaultdict(list)
     for agent, trace in sorted(traces.items()):

@@ -21,7 +21,9 @@ from harness.scenario.verdict_names import FURTHER_CHECKS, CharacteristicVerdict
 SCHEMA = "ucp-run/1"
 
 ENOUGH_ANSWERS = 20
-"""Minimum number of answers from which statements about their times are made."""
+"""Minimum number of answers. With fewer answers, the harness makes no statement about the times that agents took to
+answer.
+"""
 TOLERATED_LATENESS_S = 0.05
 """Maximum lateness of deliveries on a shared channel, in mission seconds, that a run tolerates. Without a channel,
 virtual time delivers messages after 2 to 50 ms.
@@ -452,7 +454,9 @@ class Loss(_RecordModel):
 
 
 class LeastHeld(_RecordModel):
-    """The holders of the block with the fewest holders. The loss of these vehicles would destroy the block."""
+    """The holders of the block that the fewest vehicles hold. If all these holders were lost, the block would be
+    lost.
+    """
 
     vehicles: int
     """Number of vehicles that could hold the block."""
@@ -462,7 +466,7 @@ class LeastHeld(_RecordModel):
     blocks: int
     """Number of blocks with this smallest number of holders."""
     of: int
-    """Number of all blocks."""
+    """Number of all blocks in the comparison."""
 
 
 class Survival(_RecordModel):

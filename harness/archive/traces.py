@@ -114,10 +114,8 @@ def read_clock(path: Path) -> dict[str, object]:
 
 class TraceGap(NamedTuple):
     """A place in a trace at which lines are missing or damaged. `position` is the number of handler runs before this
-    place.
-
-    `lines` and `lost_bytes` count the unreadable lines in the file. The number of lines that were never written is
-    unknown.
+    place. `lines` is the number of unreadable lines in the file, and `lost_bytes` is the size of their unreadable
+    parts. The number of lines that were never written is unknown.
     """
 
     position: int

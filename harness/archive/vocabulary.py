@@ -100,8 +100,8 @@ MAX_SHOWN = 40
 
 
 def unknown_names(runs: Iterable[HandlerRun]) -> UnknownNames:
-    """Return the first undefined name of each kind. A branch also counts as undefined if it belongs to a different
-    handler.
+    """Return the first undefined name of each kind. The name of a branch is also undefined if it belongs only to other
+    handlers.
     """
     unknown: UnknownNames = {}
     for handler, branch in dict.fromkeys((run.handler, run.branch) for run in runs):
@@ -169,8 +169,8 @@ def branch_is_known(run: HandlerRun) -> bool:
 
 
 def first_unknown(unknown: UnknownNames, kinds: Collection[Kind] | None = None) -> str | None:
-    """Return the description of the first undefined name of these kinds. If `kinds` is None, all kinds count. Return
-    None if all names are defined.
+    """Return the description of the first undefined name of these kinds, or of any kind if `kinds` is None. Return None
+    if all names are defined.
     """
     return next((description for kind, description in unknown.items() if kinds is None or kind in kinds), None)
 

@@ -20,7 +20,9 @@ from harness.errors import HarnessError, InterruptedRunError, MachineError
 ROOT = Path(__file__).parents[2]
 """The directory that contains the code of the running harness."""
 GRACE_S = 30.0
-"""Maximum number of seconds that a run may take to stop after SIGTERM. It needs them to remove its network."""
+"""Maximum number of seconds that a run may take to stop after SIGTERM. The run needs this time to remove its
+network.
+"""
 
 
 @dataclass(frozen=True)

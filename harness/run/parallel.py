@@ -196,7 +196,9 @@ def _death(exit_code: int) -> str:
 
 @contextlib.contextmanager
 def signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM inside the context. A process that is forked there starts with these signals blocked."""
+    """Block SIGINT and SIGTERM inside the context. If a process is forked inside the context, the signals are also
+    blocked in the new process.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
         yield

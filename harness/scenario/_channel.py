@@ -89,7 +89,7 @@ class ChannelModel(StrictModel):
     symbol_s: float | None = None
     """802.11: duration of a symbol in seconds. A frame consists of whole symbols."""
     padding_bits: int | None = None
-    """802.11: bits of a frame that do not belong to a byte."""
+    """802.11: bits of a frame in addition to its bytes."""
     extension_s: float | None = None
     """802.11: seconds of silence that count as part of a frame, at its end."""
     slot_s: float | None = None
@@ -97,7 +97,9 @@ class ChannelModel(StrictModel):
     difs_s: float | None = None
     """802.11: seconds that the channel must be idle before a station begins to count slots."""
     eifs_s: float | None = None
-    """802.11: the same as `difs_s`, but after a frame with an error. At least `difs_s`."""
+    """802.11: seconds that the channel must be idle after a frame with an error, in place of `difs_s`. At least
+    `difs_s`.
+    """
     contention_window: int | None = None
     """802.11: maximum number of slots of a backoff."""
     sense_s: float | None = None

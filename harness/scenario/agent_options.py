@@ -231,7 +231,7 @@ class EventOptions(StrictModel):
     mean_s: Annotated[float, Field(ge=1, le=MAX_MEAN_S, allow_inf_nan=False)] = 30.0
     """Mean number of mission seconds between two events, for the source `random`."""
     script: Annotated[list[ScriptedEvent], Field(max_length=1_000_000)] = []
-    """Events to log. It needs `source: scripted`."""
+    """Events to log, only for `source: scripted`."""
 
     @model_validator(mode="after")
     def _script_is_played(self) -> "EventOptions":

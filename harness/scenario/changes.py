@@ -1,7 +1,7 @@
 """Represent the timeline of a run as objects: network changes, faults and injections.
 
-The timeline is computed before the run from the scenario alone. Therefore every backend plays the same timeline. The
-checker does not use this timeline.
+The timeline is computed before the run, and only from the scenario. Every backend therefore plays the same timeline.
+The checker does not use this timeline.
 """
 
 from collections.abc import Mapping, Sequence

@@ -35,7 +35,9 @@ MAX_FLOOD = 100_000
 
 
 class _MatchingMessages(StrictModel):
-    """The messages of one type and one sender, among those that the rogue node receives."""
+    """An injection that applies to messages which the rogue node received. `message` and `sender` select these
+    messages.
+    """
 
     message: MessageName | None = None
     """Type of the messages. By default, any type matches."""
@@ -115,8 +117,9 @@ class Forgery(StrictModel):
     """The rogue node sends messages in the name of an agent.
 
     A forged Commit Block is sent once. It contains a new block in the name of `sender`, on top of the last chain that
-    the rogue node knows. The other messages are answers. During `for_s`, the rogue node answers each query of the other
-    agents before `sender` does. Its answer to a Chain Hash Successor Query is always "Is Top Of Chain".
+    the rogue node knows. The other messages are answers. During `for_s`, when an agent other than `sender` sends a
+    query, the rogue node answers the query before `sender` does. A forged answer to a Chain Hash Successor Query is
+    always "Is Top Of Chain".
     """
 
     ANSWERS: ClassVar = ("Block Add Response", "Chain Contain Response", "Next in Sequence Response")

@@ -60,9 +60,8 @@ size.
 
 
 def load_scenario(path: Path | str) -> Scenario:
-    """Load a scenario from a YAML file, or from the library by its name, such as "loss_15".
-
-    Raises ScenarioError. Its message names the file, the key, the value and the allowed values.
+    """Load a scenario from a YAML file, or from the library by its name, such as "loss_15". Raises ScenarioError with a
+    message that names the file, the key, the value and the allowed values.
     """
     path = Path(path)
     document = read_yaml(path, "scenario")
@@ -75,9 +74,8 @@ def load_scenario(path: Path | str) -> Scenario:
 
 
 def parse(document: dict[str, Any], beside: Path | None = None) -> Scenario:
-    """Return the scenario in a YAML document. Files that it names are relative to the directory `beside`.
-
-    Raises ScenarioError. Its message names the key, the value and the allowed values.
+    """Return the scenario in a YAML document. File names in the document are relative to the directory `beside`. Raises
+    ScenarioError with a message that names the key, the value and the allowed values.
     """
     try:
         return Scenario.model_validate(document, context={"beside": beside})

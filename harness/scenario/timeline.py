@@ -132,7 +132,9 @@ class _TimelineEntryBase(NetworkDisturbance):
 
 
 def _keys_of_faults() -> dict[str, object]:
-    """Return the model fields for faults in a timeline entry: the names of all faults, and their further keys."""
+    """Return the model fields for the faults in a timeline entry. Each fault has a field for its name, and fields for
+    its further keys.
+    """
     annotations: dict[str, Any] = {}
     descriptions: dict[str, str] = {}
     for kind in TIMELINE_FAULTS:

@@ -45,7 +45,9 @@ BAD_IN_WORDS = {
 """Number or key of a check -> phrase for its bad verdict."""
 
 UNFINISHED: Verdict = "not finished"
-"""The bad verdict on a swarm that may only need more time. It leads to its own exit status."""
+"""The verdict on a swarm that did not finish but may only need more time. It is a bad verdict with its own exit
+status.
+"""
 
 Kind = Literal["good", "bad", "unknown"]
 

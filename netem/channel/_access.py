@@ -21,8 +21,8 @@ class ChannelAccess(Protocol):
     """A rule for access to the channel. Stations are numbered from 0, and times are nanoseconds."""
 
     next_due: int
-    """The time at which the next station will send, unless a frame begins or a new frame is queued before. It is NEVER
-    if no station has a frame.
+    """The time at which the next station will send, unless a frame begins or a new frame is queued before this time.
+    NEVER if no station has a frame.
     """
 
     def take_due(self) -> list[int]:
@@ -87,8 +87,8 @@ class DutyCycle:
 
 
 class TimeSlots(DutyCycle):
-    """The access rule of a station that sends only in its own time slot. A frame that is longer than the rest of the
-    slot waits for the station's next slot.
+    """The access rule of a station that sends only in its own time slot. If a frame does not fit into the rest of the
+    current slot, the frame waits for the station's next slot.
     """
 
     def __init__(self, count: int, radio: TimeSlotRadio) -> None:

@@ -212,8 +212,8 @@ class Channel:
 
 
 def _sufficient(frame: RadioFrame, totals: Sequence[float], ratio: float) -> int:
-    """Return the receivers at which the power of the frame times `ratio` is at least the total power of all frames.
-    Each bit of the result stands for one receiver.
+    """Return the receivers at which the frame is strong enough: its power times `ratio` is at least the total power of
+    all frames. Each bit of the result stands for one receiver.
     """
     receivers = 0
     for number in [number for number, power in enumerate(frame.reach.powers) if power * ratio >= totals[number]]:

@@ -47,8 +47,8 @@ class CarrierSense:
         self._from = [0] * len(draws)
         """Station -> the time at which its countdown starts or has started."""
         self._resting: dict[int, int] = {}
-        """Station without a waiting frame that still counts down after its last frame -> the time at which the
-        countdown ends.
+        """Station that counts down although it has no frame to send -> the time at which its countdown ends. A station
+        always counts down after it has sent a frame.
         """
         self._over: deque[RadioFrame] = deque()
         """Frames that ended less than EIFS ago."""

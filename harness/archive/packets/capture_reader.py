@@ -168,8 +168,9 @@ class MessageSummary(NamedTuple):
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and the subject of an answer to this request, for comparison with `answers`. None if the message is
-        not a request. The agent that sent the request is not included, because answers do not name this agent.
+        """The type and the subject of an answer to this request. If they equal `answers` of another message, this
+        message may be the answer. None if the message is not a request. The agent that sent the request is not
+        included, because answers do not name this agent.
         """
         response = RESPONSES.get(self.message)
         return None if response is None or self.is_sealed else (response, self._subject)
@@ -181,9 +182,8 @@ class MessageSummary(NamedTuple):
 
     @property
     def _subject(self) -> bytes | None:
-        """The chain or block that a request and its answer have in common.
-
-        A Next In Sequence response also names the found block, but its request names only the chain.
+        """The chain or block about which a request asks and its answer informs. A Next In Sequence response also names
+        the found block, but its request names only the chain.
         """
         return self.chain_hash if self.message == NextInSequenceResponse.NAME else self.block_hash or self.chain_hash
 

@@ -1,8 +1,9 @@
 """Define an adapter, which reads another file format, and load adapters that users write.
 
 An adapter reads the records of another implementation, or of a separate recorder, and yields their contents one
-observation after another. It yields only recorded data. For example, an agent that did not record its handler runs gets
-no trace. If a separate recorder received the agent's datagrams, the agent still gets a capture.
+observation after another. It yields only recorded data. For example, if an agent did not record its handler runs, the
+import creates no trace for this agent. If a separate recorder received the datagrams of the agent, the import still
+creates a capture.
 """
 
 import importlib

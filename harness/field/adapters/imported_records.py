@@ -1,8 +1,8 @@
 """Import records of any format. Adapters read the records, and this module writes them into one directory as files of
 the harness.
 
-The import uses only recorded data. An agent with recorded handler runs gets a trace. If only the datagrams of an agent
-were recorded, it gets a capture.
+The import uses only recorded data. If the handler runs of an agent were recorded, the import writes a trace. If only
+the datagrams of an agent were recorded, it writes a capture.
 """
 
 import json

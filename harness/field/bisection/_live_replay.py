@@ -173,8 +173,8 @@ def script_of(record: RecordedTrace) -> PeerScript:
 
 
 def _question_key(message: Message) -> tuple[type, bytes] | None:
-    """Return two properties of a query: the type of its answer, and the hash of the chain or block that it concerns.
-    Return None if the message is not a query.
+    """Return two properties of a query: the type of the answer to it, and the hash of the chain or block about which it
+    asks. Return None if the message is not a query.
     """
     match message:
         case ChainContainQuery():

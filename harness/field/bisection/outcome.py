@@ -230,7 +230,9 @@ def _is_scenario(path: Path) -> bool:
 
 
 def _played(path: Path) -> tuple[Scenario, int] | None:
-    """Return the scenario and the seed of a run if they always give the same run. Return None otherwise."""
+    """Return the scenario and the seed of a recorded run, if repeated runs with them always give the same result.
+    Otherwise return None.
+    """
     record = RunArchive(path).record
     if record.backend != "sim" or record.scenario is None or record.seed is None:
         return None

@@ -118,8 +118,8 @@ def _vehicles(names: Iterable[ListenerName]) -> set[int]:
 
 
 def _asking_agents(transmissions: Sequence[Transmission]) -> dict[int, set[int]]:
-    """Return a mapping from the number of each answer to the agents that had asked for it. The number identifies one
-    transmission of the answer.
+    """Return a mapping: number of each answer -> the agents that had asked for this answer. An answer that was sent
+    twice has two numbers.
     """
     asking: dict[int, set[int]] = defaultdict(set)
     answers = RequestAnswers(transmissions)

@@ -43,8 +43,9 @@ LEVEL = 0.95
 PARAMETERS = ("range_m", "spread", "floor", "load")
 
 _STEPS_PER_FOLD = 50
-"""Number of distance steps between a distance and e (2.718) times this distance. Transmissions whose distances fall
-into the same step are counted together.
+"""Distances are divided into steps, each longer than the previous one by the same factor. This is the number of steps
+between a distance and e (2.718) times this distance. Transmissions with distances in the same step are counted
+together.
 """
 _MOST_ITERATIONS = 60
 _LEAST = 1e-9
@@ -387,7 +388,7 @@ def student(freedom: float) -> float:
 
 
 def wilson(delivered: float, attempts: float) -> ConfidenceInterval:
-    """Return Wilson's confidence interval of the probability that a message arrives. `delivered` of `attempts`
+    """Return Wilson's confidence interval of the probability that a message arrives, if `delivered` of `attempts`
     independent messages arrived (Wilson, JASA 22, 1927). If there are no attempts, the interval is 0 to 1.
     """
     if not attempts:

@@ -339,8 +339,8 @@ def share_of(attempts: Sequence[TransmissionAttempt]) -> DeliveryShare:
 
 
 def model_of(radio: LogDistance, loss: float = 0.0) -> DeliveryModel:
-    """Return the delivery model that corresponds to this radio with an additional loss rate. Both deliver a message
-    with the same probability at each distance.
+    """Return the delivery model that is equivalent to this radio together with an additional loss rate: at each
+    distance, a message arrives with the same probability.
     """
     range_m = 10 ** (radio.margin_db(1.0) / (10 * radio.exponent))
     return DeliveryModel(range_m, radio.shadowing_db * math.log(10) / (10 * radio.exponent), loss)

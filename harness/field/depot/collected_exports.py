@@ -67,7 +67,7 @@ class ReadExport:
     problems: list[str]
     """A sentence for each error in the file."""
     claims: dict[str, str]
-    """The wrong hashes that the file gives for blocks, by the computed hash of the block."""
+    """The wrong hashes that the file contains for blocks, by the computed hash of the block."""
 
     def blocks(self) -> set[str]:
         """Return the hashes of all blocks in the export."""
@@ -81,7 +81,7 @@ class CollectedExports:
     latest: dict[int, ReadExport]
     """The latest export of each agent, by agent ID."""
     earlier: list[ReadExport]
-    """The exports that the same agents made earlier."""
+    """Earlier exports of the agents in `latest`."""
     left_out: list[str]
     """A sentence for each unused file."""
     remarks: list[str]

@@ -139,7 +139,7 @@ def compare(paths: Iterable[Path]) -> MissionComparison:
 
 
 def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
-    """Return all differences which show that the files do not belong to one mission."""
+    """Return all differences between the files. Each of them shows that the files do not belong to one mission."""
     found = [*_deviating_values(files), *_duplicate_values(files), *_roster_differences(files)]
     for file in files:
         if file.mission is not None:
@@ -156,8 +156,8 @@ def differences(files: Sequence[ComparedFile]) -> list[MissionDifference]:
 
 
 def read(path: Path) -> ComparedFile:
-    """Read a file of a vehicle or of the mission. Raises UnreadableFileError. The message gives the reason, but not the
-    name of the file.
+    """Read a file of a vehicle or of the mission. Raises UnreadableFileError, whose message contains the reason but not
+    the name of the file.
     """
     document = _beginning(path)
     schema = document.get("schema")

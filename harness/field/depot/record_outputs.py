@@ -208,8 +208,8 @@ def agents(ids: Sequence[int]) -> str:
 
 
 def _single_copies(record: MergedRecord) -> Iterator[str]:
-    """Yield a sentence for each vehicle that is the only holder of some blocks. The loss of such a vehicle would have
-    destroyed these blocks.
+    """Yield a sentence for each vehicle that is the only holder of some blocks. If this vehicle had been lost, these
+    blocks would not exist any more.
     """
     if len(record.collected.latest) < 2:
         return

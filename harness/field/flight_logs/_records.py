@@ -123,11 +123,11 @@ class Parameter(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A jump of the log's clock. It is recorded when two records have new times that are consistent with each other but
-    not with the old time.
+    """A jump of the log's clock. The jump is recorded when two records have new times that are consistent with each
+    other but not with the old time.
 
-    A restart of the autopilot, a correction of the computer's clock, and a pause of the log look the same. Only if the
-    time decreases, the clock was certainly wrong.
+    The cause may be a restart of the autopilot, a correction of the computer's clock, or a pause of the log. The log
+    does not show which. Only if the time decreases, the clock was certainly wrong.
     """
 
     at_us: int

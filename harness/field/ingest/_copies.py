@@ -77,7 +77,8 @@ def _is_copy(incarnation: TraceIncarnation, other: TraceIncarnation) -> bool:
 
 def _overlap(incarnation: TraceIncarnation, other: TraceIncarnation, *, anywhere: bool = False) -> bool:
     """Return true if the times of two traces overlap. Two overlapping traces of one agent cannot belong to the same
-    flight. Incarnations in the same file are successive, so their times are ignored, unless `anywhere` is true.
+    flight. Two incarnations in the same file follow each other, so the function returns false for them, unless
+    `anywhere` is true.
     """
     if (incarnation.path == other.path and not anywhere) or not incarnation.runs or not other.runs:
         return False

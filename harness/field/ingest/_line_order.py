@@ -67,7 +67,7 @@ def _repeated(runs: Sequence[HandlerRun]) -> Iterator[ReorderedPart]:
 
 
 def _happens_once(part: Sequence[HandlerRun]) -> bool:
-    """Return true if these handler runs had an effect that an agent cannot have twice."""
+    """Return true if these handler runs had an effect that an agent cannot repeat."""
     return any(
         run.changes or run.sent or run.tally or run.started or not isinstance(run.trigger, MessageTrigger)
         for run in part
@@ -83,7 +83,7 @@ def _triggers_next(runs: Sequence[HandlerRun], position: int) -> bool:
 
 
 def _are_swapped(runs: Sequence[HandlerRun], order: Sequence[int], number: int) -> bool:
-    """Return true if the handler run at position `number` belongs after the handler run that follows it."""
+    """Return true if the handler run at position `number` and the next handler run are in the wrong order."""
     first, second = runs[order[number]], runs[order[number + 1]]
     before_s = runs[order[number - 1]].t if number else 0.0
     if second.t < first.t:

@@ -70,8 +70,8 @@ class TraceIncarnation:
 
     @property
     def agent_id(self) -> int | None:
-        """The ID of the agent. It comes from the header, the source of the lines, the sent datagrams or the file name,
-        in this order. The value is None if the ID is unknown.
+        """The ID of the agent. The first known source is used: the header, the source of the lines, the sent datagrams,
+        or the file name. The value is None if no source contains the ID.
         """
         if self.header is not None:
             return self.header.agent_id

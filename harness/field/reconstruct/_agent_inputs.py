@@ -93,9 +93,7 @@ class RecordedInput:
 
 
 class MissingInputs(Protocol):
-    """Records other than the agent's own trace. These records may contain inputs that a trace of version 1 does not
-    contain.
-    """
+    """Records other than the agent's own trace. They may contain the inputs that a trace of version 1 omits."""
 
     def datagrams(self, sender: int, sequence: int) -> list[bytes]: ...
 
@@ -105,8 +103,8 @@ class MissingInputs(Protocol):
 def inputs_by_incarnation(
     trace: Trace, header: CheckedHeader, missing: MissingInputs
 ) -> tuple[list[list[RecordedInput]], str | None]:
-    """Return the usable inputs of each incarnation, and the reason why later inputs are unusable. The reason names the
-    line of the trace. It is None if all inputs are usable.
+    """Return the usable inputs of each incarnation. Also return the reason why later inputs are unusable, with the line
+    of the trace, or None if all inputs are usable.
     """
     reader = _InputReader(header, missing)
     incarnations: list[list[RecordedInput]] = []

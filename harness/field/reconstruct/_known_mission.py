@@ -140,8 +140,8 @@ class OtherRecords:
 
     @property
     def _reason_unreadable(self) -> str:
-        """The reason why event data cannot be divided into events. The text is the end of a sentence. It is empty if
-        the event data are not encrypted.
+        """The reason why event data cannot be divided into events, as the end of a sentence. It is empty unless the
+        event data are encrypted.
         """
         exports = self._exports.values()
         if not any(sealed_to(base64.b64decode(export.inception.block_data)) for export in exports):

@@ -127,8 +127,8 @@ class _OtherAgent:
                 yield shown(f"    has no line for {message.message[:60]} {message.seq}", style="yellow")
 
     def _nearest(self, numbers: list[int], at_s: float) -> list[tuple[int, HandlerRun]]:
-        """Return at most one of these handler runs: the nearest in time to the current step. Several may match a
-        message, because sequence numbers repeat after restarts.
+        """Return the handler run that is nearest in time to the current step, in a list. The list is empty if there is
+        no handler run. Several handler runs may match a message, because sequence numbers repeat after restarts.
         """
         runs = (self.runs[number] for number in numbers)
         return sorted(runs, key=lambda numbered: abs(self.clock.at(numbered[1].t) - at_s))[:1]

@@ -1,8 +1,7 @@
-"""Play a record: give the recorded inputs to the reference core or to the agent core, forward or back. The result is
-the same each time.
+"""Play a record: pass the recorded inputs to the reference core or to the agent core, forward or back.
 
-To go back, the player restores a checkpoint and plays forward from it. To reverse single steps, it would need an
-inverse of each handler.
+The result is the same each time. To go back, the player restores a checkpoint and plays forward from this checkpoint.
+The alternative was rejected: to reverse single steps, each handler would need an inverse.
 """
 
 from bisect import bisect_left
@@ -110,8 +109,8 @@ class RecordPlayer:
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the most recent entry at which the state became known again after a gap, or None if there
-        was no such entry.
+        """The position after the entry at which the state became known again after the last gap. None if there was no
+        such entry.
         """
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}
@@ -136,7 +135,9 @@ class RecordPlayer:
         return self.position == len(self.entries)
 
     def deviations_here(self) -> list[StepDeviation]:
-        """Return the deviations at the last played entry, including those that only the next entry reveals."""
+        """Return the deviations at the last played entry. Some of them, such as a missing message, are known only
+        because of the next entry.
+        """
         result = self.result
         here = result.deviations[bisect_left(result.positions, self.position) :]
         upcoming = None if self.at_end else self.entries[self.position]

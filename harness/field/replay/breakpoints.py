@@ -81,10 +81,9 @@ def blocks_of(entry: RecordEntry) -> set[str]:
 
 @cache
 def source_of(handler: str) -> str:
-    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". If a breakpoint is on this line,
-    a debugger stops there.
-
-    If the code is in the working directory, the path is relative to it.
+    """Return the place of a handler's first statement, such as "ucp/reconcile.py:187". A debugger with a breakpoint on
+    this line stops when the handler runs. If the code is in the working directory, the path is relative to the working
+    directory.
     """
     code = HANDLERS[handler].run.__code__
     defined = code.co_firstlineno + sum(1 for line in _decorators(handler))

@@ -91,8 +91,8 @@ class _BagVersion1Reader:
 
 
 def _declared_length(buffer: Buffer, end: int, data: bytes) -> int:
-    """Return the value of the length field that belongs to `data`. The field is directly before `data`, which ends at
-    the position `end` of the buffer.
+    """Return the declared length of `data`. The length field is directly before `data`, and `data` ends at the position
+    `end` of the buffer.
     """
     return int(_U32.unpack_from(buffer, end - len(data) - _U32.size)[0])
 

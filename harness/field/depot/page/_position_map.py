@@ -1,8 +1,8 @@
-"""Draw a map of logged events. The path of each vehicle is a line, and an event without a position is drawn at the last
-position of its vehicle.
+"""Draw a map of logged events.
 
-A ring marks a block that only one vehicle holds. The loss of this vehicle would have destroyed the block. If blocks of
-a vehicle were lost, its line is dotted between the positions before and after these blocks.
+The path of each vehicle is a line, and an event without a position is drawn at the last position of its vehicle. A ring
+marks a block that only one vehicle holds. The loss of this vehicle would have destroyed the block. The line is dotted
+where blocks of the vehicle were lost: between the last position before and the first position after these blocks.
 """
 
 import math

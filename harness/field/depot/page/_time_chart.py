@@ -176,8 +176,8 @@ def _bars(
 
 
 def shade(holders: int, vehicles: int) -> int:
-    """Return the number of the shade of grey for a block that this number of vehicles hold. Shade 0 stands for one
-    holder, and the last shade stands for all vehicles.
+    """Return the shade of grey for a block, as a number. The shade shows how many vehicles hold the block: shade 0
+    stands for one vehicle, and the last shade for all vehicles.
     """
     if holders <= 1:
         return 0
