@@ -165,8 +165,8 @@ class LinkConditions:
 
     @property
     def remembers(self) -> bool:
-        """True if earlier packets from the same sender to the same receiver affect whether and when a packet
-        arrives.
+        """True if the link has a memory: earlier packets from the same sender to the same receiver affect whether a
+        packet arrives, or when it arrives.
         """
         return isinstance(self.loss, GilbertElliott) or self.rate is not None or self.limit is not None
 

@@ -83,7 +83,7 @@ class Autopilot:
 
     @property
     def ready(self) -> bool:
-        """True if the vehicle knows its position. It can be armed only then."""
+        """True if the vehicle knows its position. A vehicle without a known position cannot be armed."""
         return self.has_booted and self.failsafes.has_gps
 
     @property

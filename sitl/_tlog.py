@@ -1,6 +1,8 @@
-"""Write the telemetry log. For each received MAVLink frame, it contains the time of arrival and then the frame. The
-format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is a big-endian u64 in microseconds since
-the Unix epoch. Its two lowest bits are replaced by the number of the link.
+"""Write the telemetry log. For each received MAVLink frame, the log contains the time of arrival, followed by the
+frame.
+
+The format is that of MAVProxy, Mission Planner and pymavlink (`.tlog`). The time is a big-endian u64 in microseconds
+since the Unix epoch. The number of the link replaces the two lowest bits of the time.
 """
 
 from __future__ import annotations

@@ -234,10 +234,11 @@ class ArduPilot:
                 return {"LOG_FILE_TIMEOUT": PATIENT_S}
 
     def _bounded(self) -> list[str]:
-        """The beginning of a command line that limits the size of each file that ArduPilot writes. The limit is the
-        maximum size of the log. When a log reaches the limit, ArduPilot behaves as if the disk were slow, and stops
-        writing. It would start another log after LOG_FILE_TIMEOUT seconds. `ulimit -f` counts blocks of 512 bytes
-        (POSIX).
+        """The beginning of a command line that limits the size of each file that ArduPilot writes.
+
+        The limit is the maximum size of the log. When a log reaches the limit, ArduPilot behaves as if the disk were
+        slow, and stops writing. After LOG_FILE_TIMEOUT seconds, ArduPilot would start another log. `ulimit -f` counts
+        blocks of 512 bytes (POSIX).
         """
         if not self.setup.log_mib:
             return []

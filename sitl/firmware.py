@@ -321,7 +321,7 @@ def _locked(home: Path, watcher: InstallWatcher) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ways_out(home: Path) -> Iterator[None]:
-    """Return a context manager. It adds a solution to the message of a network error, and converts a disk error to
+    """Return a context manager that adds a solution to the message of a network error, and converts a disk error to
     CacheError.
     """
     try:

@@ -39,9 +39,7 @@ class GroundStation(asyncio.DatagramProtocol):
         self, address: ListenAddress, now: Callable[[], float], taken_over: Callable[[list[int]], None]
     ) -> None:
         """Create the object. Callers use `open` instead. `now` returns the mission second, for the log of commands.
-
-        `taken_over` is called when an operator takes over vehicles from the pilot. Its argument contains these
-        vehicles.
+        When an operator takes over vehicles from the pilot, `taken_over` is called with these vehicles as its argument.
         """
         self._address = address
         self._now = now

@@ -1,6 +1,5 @@
-"""List the names and numbers (HEARTBEAT.custom_mode) of ArduPilot's flight modes by vehicle type.
-
-They equal the values of the parameter FLTMODE1 in ArduCopter and ArduPlane, and of MODE1 in ArduRover.
+"""List the names and numbers (HEARTBEAT.custom_mode) of ArduPilot's flight modes by vehicle type. The numbers equal the
+values of the parameter FLTMODE1 in ArduCopter and ArduPlane, and of MODE1 in ArduRover.
 """
 
 from __future__ import annotations

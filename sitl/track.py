@@ -88,8 +88,8 @@ def _guided(waypoints: Sequence[Waypoint], vehicle_type: VehicleType, start: Mot
 def _manoeuvre(
     model: MotionModel, waypoint: Waypoint, start: MotionState, before: Waypoint | None, after: Waypoint | None
 ) -> Sequence[MotionSegment]:
-    """Return the segments for one waypoint. They begin with the motion `start`. `before` and `after` are the previous
-    and the next waypoint.
+    """Return the segments for one waypoint. The first segment begins with the motion `start`. `before` and `after` are
+    the previous and the next waypoint.
     """
     led = before.place if before is not None and before.kind in ("go_to", "loiter") else None
     match waypoint.kind:

@@ -57,7 +57,9 @@ def has_packed_parts(descriptor: int) -> bool:
 
 
 def hole_at_begin(descriptor: int) -> int:
-    """Return the number of bytes of the hole at the beginning of a file. The position in the file does not change."""
+    """Return the number of bytes of the hole at the beginning of a file. The function does not change the current
+    position in the file.
+    """
     position = os.lseek(descriptor, 0, os.SEEK_CUR)
     try:
         return os.lseek(descriptor, 0, os.SEEK_DATA)

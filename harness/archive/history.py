@@ -198,8 +198,8 @@ class HistoryReader:
     """A reader of the handler runs of one incarnation of an agent (the time between two restarts), one run after
     another.
 
-    The report and the live page both use this class, so both show the same start and end of each vote and reconcile. A
-    reconcile that begins during a vote does not end the vote. The vote ends when its timer expires.
+    The report and the live page both use this class, so that both show the same start and end of each vote and
+    reconcile. A vote ends when its timer expires. A reconcile that begins before this time does not end the vote.
     """
 
     def __init__(self, agent: int) -> None:

@@ -1,8 +1,8 @@
 """Read run.json in any condition: complete, truncated, modified, or of another version.
 
-The module removes the smallest invalid parts until the rest is valid. It removes only the invalid entries of a list. It
-removes an entry completely if a required key is missing. If it rejected the whole file instead, the record of every
-killed run would be lost.
+The module removes the smallest invalid parts until the remaining document is valid. For example, if some entries of a
+list are invalid, it removes only these entries. If a required key of an entry is missing, it removes the entry. The
+alternative was to reject the whole file. Then the record of every killed run would be lost.
 """
 
 from collections.abc import Iterator, Sequence

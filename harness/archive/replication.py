@@ -1,8 +1,7 @@
 """Compute from traces how the mission data spread over the agents. The result describes the agents' chains at each
-mission second.
+mission second. The checker computes the same numeric results (`harness.checker._liveness`) for the end of a run.
 
-The checker computes the same numeric results (`harness.checker._liveness`) for the end of a run. Only the chains of
-living agents count. The copies of each completed block are counted in these chains.
+The module counts the copies of each completed block in the chains of the living agents. Other chains are ignored.
 """
 
 from collections import Counter

@@ -188,8 +188,8 @@ class AgentFailure(_RecordModel):
 
 
 class AgentRecord(_RecordModel):
-    """The outcome of one agent. It is exported, not exported, killed, rebooting, crashed, hung, broken, not supported,
-    paused, running or not started.
+    """The record of one agent. Its `outcome` is one of: exported, not exported, killed, rebooting, crashed, hung,
+    broken, not supported, paused, running, not started.
 
     Counters are sums over all incarnations of the agent. An unknown counter is null.
     """

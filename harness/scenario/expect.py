@@ -120,7 +120,7 @@ class CommonBlocks(StrictModel):
     agents: Annotated[list[VehicleId], Field(min_length=1)]
     """IDs of the agents."""
     blocks: Count
-    """Number of blocks at the beginning that the chains of all these agents have in common."""
+    """Expected number of blocks at the beginning of the chains that are equal in the chains of all these agents."""
 
 
 class Expect(StrictModel):

@@ -104,7 +104,9 @@ class Channel:
         return finished
 
     def move(self, places: Sequence[Place], now: float) -> None:
-        """Set the positions of the vehicles. Frames on the air keep the received powers with which they began."""
+        """Set the positions of the vehicles. For frames that are already on the air, the received powers do not
+        change.
+        """
         self._play(nanoseconds(now))
         self._links.move(places)
 

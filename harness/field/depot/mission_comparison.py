@@ -46,7 +46,7 @@ class UnreadableFileError(HarnessError):
 
 @dataclass(frozen=True)
 class SharedValue:
-    """A value that must be the same in all files. `key` is the name of the value in this file."""
+    """A value that must be the same in all files. `key` is the name of the value in the file from which it was read."""
 
     key: str
     value: Hashable

@@ -68,7 +68,8 @@ class EkfStatus(NamedTuple):
     """The state of the active position filter (EKF). There is at most one record per second while the flags stay the
     same.
 
-    A variance is the square root of the normalised innovation test ratio. Above 1 the EKF rejects the measurement.
+    A variance is the square root of the normalised innovation test ratio. If a variance is above 1, the EKF rejects the
+    measurement.
     """
 
     at_us: int

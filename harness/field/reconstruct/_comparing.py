@@ -309,8 +309,8 @@ class SoloSimulations:
         return explaining[names[0]]
 
     def _explain_by_tolerance(self, header: CheckedHeader, incarnations: Incarnations) -> SoloSimulation | None:
-        """Return a simulation in which the agent may ignore messages or let timers expire early, if this simulation
-        explains the whole record. Otherwise return None.
+        """Simulate an agent that may ignore messages or let timers expire early. Return the simulation if it explains
+        the whole record. Otherwise return None.
         """
         agent = f"agent {header.agent_id}"
         ignoring = rehearse(header, incarnations, tolerance=ToleratedDeviations(ignoring=True))
