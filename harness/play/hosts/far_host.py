@@ -20,7 +20,13 @@ from harness.play.hosts._nursery import OWN_AGENT, Nursery
 from harness.play.hosts._vehicle_host import VehicleHost
 from harness.play.remote._far_ends import WORKER
 from harness.play.remote._wire import KEYS
-from harness.play.remote.join import JoinRequest, RunOverError, connect, directory_of_agents, play_incarnations
+from harness.play.remote.join import (
+    JoinRequest,
+    RunOverError,
+    connect_patiently,
+    directory_of_agents,
+    play_incarnations,
+)
 from netem import far_network
 from netem.errors import LabUnavailable
 
@@ -52,7 +58,7 @@ async def _play_vehicles(request: JoinRequest, worker: str, nursery: Nursery, di
     folder = directory / "vehicles"
     folder.mkdir()
     try:
-        joined = await connect(request, worker)
+        joined = await connect_patiently(request, worker)
     except RunOverError:
         return
     await VehicleHost(nursery, folder).run(joined)

@@ -29,6 +29,11 @@ from harness.scenario.changes import NetworkChange, timeline_of
 from netem.conditions import Delay, LinkConditions, NetworkConditions
 from ucp.messages import PORT
 
+MAX_MEASUREMENTS = 8
+"""Maximum number of connections whose delay the harness measures at the same time. More measurements would delay each
+other.
+"""
+
 
 @dataclass
 class _RemoteVehicle:
@@ -83,6 +88,7 @@ class RemoteAgents:
         agents = hosts.agents if hosts else scenario.remote.agents if scenario.remote else ()
         self._vehicles = {agent: _RemoteVehicle(agent) for agent in agents}
         self._ended = False
+        self._measuring = asyncio.Semaphore(MAX_MEASUREMENTS)
         self._far_ends: FarEnds | None = None
         self.when_cut_off: Callable[[], None] = lambda: None
         """A function that is called when a vehicle is cut off or connected again."""
@@ -216,7 +222,8 @@ class RemoteAgents:
             return
         vehicle = self._vehicles[far_end.agent_id]
         if not vehicle.joined.is_set():
-            vehicle.delay_s = await far_end.measured_delay()
+            async with self._measuring:
+                vehicle.delay_s = await far_end.measured_delay()
         vehicle.host, vehicle.session, vehicle.command = far_end.host, far_end.session, far_end.command
         vehicle.joins += 1
         if vehicle.stand_in is not None:

@@ -54,6 +54,10 @@ class JoinError(HarnessError):
     """An error: the agent cannot join a lab."""
 
 
+class JoinRefusedError(JoinError):
+    """An error: the harness refused the agent. The reason is in the message."""
+
+
 @dataclass(frozen=True)
 class JoinRequest:
     """The request of the user: the address of the harness, the agent's ID and command, and the secret."""
@@ -137,9 +141,10 @@ async def play_incarnations(
     request: JoinRequest, start: StartWorker, say: Callable[[str], None], directory: Path
 ) -> None:
     """Run incarnations of one agent, whose files are in `directory`. This process may run several agents at the same
-    time. See `join`.
+    time. Unlike `join`, connect again if the harness does not answer in time. The harness is busy if hundreds of agents
+    join at the same time.
     """
-    await _Joining(request, start, say).play(directory)
+    await _Joining(request, start, say, is_patient=True).play(directory)
 
 
 async def _start_worker(
@@ -189,8 +194,10 @@ def _locked(path: Path) -> Iterator[None]:
 class _Joining:
     """A far end that runs one incarnation of its agent after another."""
 
-    def __init__(self, request: JoinRequest, start: StartWorker, say: Callable[[str], None]) -> None:
-        self._request, self._start, self._say = request, start, say
+    def __init__(
+        self, request: JoinRequest, start: StartWorker, say: Callable[[str], None], *, is_patient: bool = False
+    ) -> None:
+        self._request, self._start, self._say, self._is_patient = request, start, say, is_patient
         self._session = secrets.token_hex(8)
         self._said = ""
 
@@ -215,7 +222,7 @@ class _Joining:
         joined = False
         while True:
             try:
-                connected = await connect(self._request, self._session)
+                connected = await self._connect()
             except RunOverError as error:
                 if self._request.service:
                     self._say_once(f"waits for a harness at {self._request.address}")
@@ -235,6 +242,12 @@ class _Joining:
             shutil.rmtree(directory / "disks", ignore_errors=True)
             self._say_once(f"agent {self._request.agent_id} has joined {connected.name!r} at {self._request.address}")
             await self._play_run(connected, directory)
+
+    async def _connect(self) -> JoinedRun:
+        """Connect to the harness. Raises RunOverError or JoinError."""
+        if self._is_patient:
+            return await connect_patiently(self._request, self._session)
+        return await connect(self._request, self._session)
 
     async def _play_run(self, first: JoinedRun, directory: Path) -> None:
         """Run incarnations until the harness accepts no further connection."""
@@ -319,6 +332,19 @@ class _Joining:
         return None
 
 
+async def connect_patiently(request: JoinRequest, session: str) -> JoinedRun:
+    """Connect to the harness, and try again if it does not answer. Raises RunOverError if no harness listens, and
+    JoinRefusedError if the harness refuses the agent.
+    """
+    while True:
+        try:
+            return await connect(request, session)
+        except JoinRefusedError:
+            raise
+        except JoinError:
+            await asyncio.sleep(RETRY_S)
+
+
 async def connect(request: JoinRequest, session: str) -> JoinedRun:
     """Connect to the harness. Raises RunOverError if no harness listens, and JoinError for any other problem."""
     loop = asyncio.get_running_loop()
@@ -348,7 +374,7 @@ async def connect(request: JoinRequest, session: str) -> JoinedRun:
             case ConnectionRefusedError():
                 raise RunOverError(f"no harness listens at {request.address}") from None
             case RefusedError():
-                raise JoinError(f"{where} refused agent {request.agent_id}: {error}") from None
+                raise JoinRefusedError(f"{where} refused agent {request.agent_id}: {error}") from None
             case HandshakeError():
                 raise JoinError(f"{where} {error}") from None
             case TimeoutError():

@@ -6,15 +6,16 @@ import os
 import socket
 import struct
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from harness.archive.directory import RunDirectory
-from harness.play.remote import _far_clock, join
+from harness.play.remote import _far_clock, _remote_agents, join
 from harness.play.remote._far_clock import FarClock, ping, pong
-from harness.play.remote._far_ends import FarEnds
+from harness.play.remote._far_ends import FarEnd, FarEnds
 from harness.play.remote._handshake import (
     MAX_TEXT_BYTES,
     PROTOCOL,
@@ -358,3 +359,74 @@ def test_far_end_without_encryption_gets_no_keys() -> None:
         assert "this mission has keys, which must travel encrypted" in refused
         sealed = Hello(words, connection, SECRET, b"", b"", KeyExchange(), bytes(32))
         assert FarEnds(host, "keys", has_keys=True).refusal(sealed, "192.168.7.2") == ""
+
+
+def test_worker_connects_again_until_the_harness_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = iter([join.JoinError("does not answer"), join.JoinError("closed the connection"), "joined"])
+    assert asyncio.run(connected(monkeypatch, answers)) == "joined"
+
+
+@pytest.mark.parametrize("error", [join.JoinRefusedError("it has begun"), join.RunOverError("no harness listens")])
+def test_worker_gives_up_if_it_is_refused_or_the_run_is_over(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(type(error)):
+        asyncio.run(connected(monkeypatch, iter([join.JoinError("does not answer"), error])))
+
+
+async def connected(monkeypatch: pytest.MonkeyPatch, answers: Iterator[Any]) -> Any:
+    """Connect patiently to a harness that gives these answers, one for each attempt."""
+
+    async def connect(request: join.JoinRequest, session: str) -> Any:
+        assert session == "session", "the harness takes another session for another process"
+        if isinstance(answer := next(answers), Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(join, "connect", connect)
+    monkeypatch.setattr(join, "RETRY_S", 0.0)
+    request = join.JoinRequest("127.0.0.1", 1, 1, SECRET, [], service=False)
+    return await join.connect_patiently(request, "session")
+
+
+def test_refused_far_end_learns_the_reason(tmp_path: Path) -> None:
+    scenario = parse(
+        {"name": "refused", "agents": 2, "vehicles": {"kind": "none"}, "remote": {"agents": [2], "secret_file": "none"}}
+    )
+
+    async def both() -> None:
+        listener = socket.create_server(("127.0.0.1", 0))
+        listener.setblocking(False)
+        port = listener.getsockname()[1]
+        host = RemoteAgents(scenario, cast("RunDirectory", None), lambda: 0.0)
+        async with FarEnds(host, "refused").opened([listener], SECRET, tmp_path):
+            await join.connect(join.JoinRequest("127.0.0.1", port, 3, SECRET, [], service=False), "session")
+
+    with pytest.raises(join.JoinRefusedError, match="this mission awaits agent 2, not agent 3"):
+        asyncio.run(both())
+
+
+def test_harness_measures_few_delays_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    agents = range(2, 50)
+    remote = {"agents": [*agents], "secret_file": "none"}
+    scenario = parse({"name": "many", "agents": 50, "vehicles": {"kind": "none"}, "remote": remote})
+    measuring, most = 0, 0
+
+    class SlowFarEnd(FarEnd):
+        async def measured_delay(self) -> float:
+            nonlocal measuring, most
+            measuring += 1
+            most = max(most, measuring)
+            await asyncio.sleep(0)
+            measuring -= 1
+            return 0.001
+
+        async def keep(self) -> None:
+            pass
+
+    async def receive() -> None:
+        host = RemoteAgents(scenario, cast("RunDirectory", None), lambda: 0.0)
+        with socket.socket() as connection:
+            ends = [SlowFarEnd(agent, "session", [], "pi", connection, Channel(KEY, KEY)) for agent in agents]
+            await asyncio.gather(*map(host.receive, ends))
+
+    asyncio.run(receive())
+    assert most == _remote_agents.MAX_MEASUREMENTS
