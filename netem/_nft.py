@@ -255,7 +255,7 @@ def _only_mark(rules: list[list[dict[str, Any]]]) -> int | None:
 
 
 def _loss(rules: list[list[dict[str, Any]]]) -> float:
-    """Return the probability with which these nftables rules drop a packet."""
+    """Return the probability that these nftables rules drop a packet."""
     for expressions in rules:
         if any("drop" in expression for expression in expressions):
             matches = [expression["match"] for expression in expressions if "match" in expression]

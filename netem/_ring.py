@@ -43,7 +43,7 @@ _MACS = 12  # bytes of both addresses, before a VLAN tag
 BLOCK_BYTES = 1 << 17  # larger than any frame, including those that veth pairs carry before TCP segmentation
 _SLOT_BYTES = 2048  # without meaning in TPACKET_V3, but it must divide a block
 RETIRE_MS = 100
-"""Milliseconds after which the kernel hands over a block that is not full."""
+"""The kernel hands over a block after this number of milliseconds, even if the block is not full."""
 
 
 class CaptureRing:

@@ -117,7 +117,8 @@ def delay_deviation(received: ReceivedStream) -> Estimate:
 def rate(received: ReceivedStream, packet_bits: int) -> Estimate:
     """Return the data rate in bits per second, from the longest series of packets that arrived without a pause.
 
-    The limits assume that the first and the last packet of the series may be as late as the latest packet.
+    The first and the last packet of the series may be as late as the latest packet of the stream. The limits of the
+    confidence interval take this lateness into account.
     """
     run: list[float] = []
     longest: list[float] = []

@@ -216,8 +216,8 @@ class NetemEngine(Engine):
         return {vehicle: classes.get(port.index, {}) for vehicle, port in self._ports.items()}
 
     def _filters(self) -> tuple[dict[int, tuple[int, int] | None], dict[int, tuple[set[int], int]]]:
-        """Return two mappings by vehicle: the mark of the packets that this vehicle sends, and the groups whose packets
-        may reach this vehicle, with the number of packets that were dropped.
+        """Return two mappings by vehicle. The first contains the mark of the packets that the vehicle sends. The second
+        contains the groups whose packets may reach the vehicle, and the number of dropped packets.
         """
         marks = {vehicle: port.read_mark(self._netlink) for vehicle, port in self._ports.items()}
         return marks, {vehicle: port.accepted_groups(self._netlink) for vehicle, port in self._ports.items()}

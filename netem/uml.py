@@ -46,8 +46,8 @@ MEMORY = "2G"
 
 BEAT_S = 5
 SILENCE_LIMIT_S = 90.0
-"""Seconds without output after which a guest counts as hung. A guest boots within a few seconds, and then prints
-regularly.
+"""A guest counts as hung if it prints nothing for this number of seconds. A guest boots within a few seconds, and then
+prints regularly.
 """
 
 POLL_S = 0.05

@@ -54,7 +54,8 @@ class CommandLog:
         self._commands: list[dict[str, Any]] = []
 
     def note(self, message: Any, vehicle_ids: Iterable[int], at_s: float) -> bool:
-        """Record a message to these vehicles at mission second `at_s`, if it is a command.
+        """Record an operator's message to these vehicles, if the message is a command. `at_s` is the mission second of
+        the message.
 
         Return true if the operator takes over the vehicles from the pilot with this message.
         """

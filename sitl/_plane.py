@@ -68,9 +68,7 @@ class PlaneMotion:
         return [*run, *path.segments]
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off as in mode TAKEOFF: fly to the left edge of a circle that lies ahead, and then fly along this circle
-        without end.
-        """
+        """Take off as in mode TAKEOFF: fly to the left edge of a circle that lies ahead, and then circle forever."""
         run, path = _lift_off(start, altitude_m, min(LEVEL_M, altitude_m))
         place = _point_ahead(start, AHEAD_M)._replace(up_m=altitude_m)
         path.straight_to(_on_circle(place, LOITER_RADIUS_M, start.yaw_rad - math.pi / 2))
@@ -236,8 +234,9 @@ class _TurnToPlace(NamedTuple):
 
 
 def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
-    """Return the left or right turn, whichever gives the shorter path to the place. Return None if the place is inside
-    the circles of both turns.
+    """Return the left or right turn, whichever gives the shorter path to the place. The function adds `rather_left_m`
+    to the length of the path with the right turn. A plane that is turning right continues to the right unless the other
+    path is much shorter. Return None if the place is inside the circles of both turns.
     """
     ways = []
     for side in (1, -1):  # to the right, to the left

@@ -46,8 +46,8 @@ class SimulatedFailure:
     """An event to simulate, such as a GPS failure. `what` names the event, and completes a sentence that begins with
     "simulate". Each element of `ways` is a set of parameters that causes the event.
 
-    If `station_is_heard` is true or false, it states whether the vehicle receives heartbeats of its ground station from
-    now on. If it is None, this does not change.
+    `station_is_heard` is true if the event lets the vehicle receive heartbeats of its ground station, and false if the
+    event stops them. It is None if the event has no effect on heartbeats.
     """
 
     what: str

@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from sitl.vehicle import VehicleError
 
 STALL_S = 20.0
-"""Seconds without data after which a download fails."""
+"""A download fails if no data arrive for this number of seconds."""
 
 CHUNK = 1 << 16  # bytes
 

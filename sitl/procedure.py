@@ -96,8 +96,8 @@ class Commander:
         self.link.ask_for_mode(MODES[self.vehicle_type][name])
 
     def arming(self) -> ProcedureStep | None:
-        """Return the step that must be complete next, so that the vehicle becomes armed. Return None if the vehicle is
-        armed.
+        """Return the next step on the way to an armed vehicle: wait until the vehicle is ready, or arm it. Return None
+        if the vehicle is armed.
         """
         if self.state.armed:
             return None

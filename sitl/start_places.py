@@ -49,7 +49,7 @@ class HomeOffset(NamedTuple):
 
 
 def named(name: str, beside: Path | None, environ: Mapping[str, str]) -> Home:
-    """Return the location with this name from the first file that has it. Raises VehicleError."""
+    """Return the location with this name from the first file that contains the name. Raises VehicleError."""
     files = [path for path in _files(beside, environ) if path.is_file()]
     known: set[str] = set()
     for path in files:

@@ -240,8 +240,9 @@ class _LimitedContent(io.RawIOBase):
         return self._unpacked(most) if self.packed else self._read(most)
 
     def _read(self, most: int) -> bytes:
-        """Return up to `most` bytes of a file that is not gzip data. In place of a packed part, the file contains NUL
-        bytes. The method returns the content of such a part from the gzip file, if the gzip file contains it.
+        """Return up to `most` bytes of a file that is not gzip data. If the next part of the file was packed, the file
+        has only NUL bytes at this place. The method then returns the content of the part from the gzip file, if the
+        gzip file contains this part.
         """
         begin = self._file.tell()
         data: bytes = self._file.read(most)

@@ -142,11 +142,11 @@ class RunDirectory:
             shutil.copyfile(export, self.agents / export.name)
 
     def append_trace(self, agent_id: int, directory: Path, copied_bytes: int = 0) -> int:
-        """Append the new part of the current incarnation's trace to the complete trace of the agent. Return the size of
-        this part in bytes.
+        """Append the trace of the current incarnation to the complete trace of the agent. Return the number of appended
+        bytes.
 
-        `copied_bytes` is the size of the part that was appended before. An incomplete last line is omitted. The agent
-        was killed while it wrote the line, or is still writing it.
+        The first `copied_bytes` bytes of the incarnation's trace are skipped, because they were appended before. An
+        incomplete last line is omitted, because the agent was killed while it wrote the line, or is still writing it.
         """
         later = directory / f"{agent_id}{TRACE_SUFFIX}"
         if not later.exists():

@@ -25,8 +25,8 @@ ENOUGH_ANSWERS = 20
 answer.
 """
 TOLERATED_LATENESS_S = 0.05
-"""Maximum lateness of deliveries on a shared channel, in mission seconds, that a run tolerates. Without a channel,
-virtual time delivers messages after 2 to 50 ms.
+"""Maximum acceptable lateness of deliveries on a shared channel, in mission seconds. For comparison: without a shared
+channel, virtual time delivers messages after 2 to 50 ms.
 """
 
 
@@ -82,7 +82,7 @@ class NetworkState(_RecordModel):
     detail: str
     fully_connected: bool
     planned_s: float | None = None
-    """The mission second of the change in the scenario. null if the change was punctual."""
+    """The mission second at which the scenario planned the change. null if the change was punctual."""
 
 
 class FaultRecord(_RecordModel):
@@ -100,7 +100,7 @@ class FaultRecord(_RecordModel):
     it.
     """
     planned_s: float | None = None
-    """The mission second of the change in the scenario. null if the change was punctual."""
+    """The mission second at which the scenario planned the change. null if the change was punctual."""
 
     @property
     def kind(self) -> type[faults.Fault]:
@@ -321,7 +321,7 @@ class ChannelRecord(_RecordModel):
 
 class ReceiverCounters(_RecordModel):
     """Numbers of packets to one vehicle: packets that the kernel passed, packets that it lost, and packets cut off by a
-    partition. The further keys are the network conditions that were applied.
+    partition. The JSON object also contains the network conditions that were applied.
     """
 
     model_config = ConfigDict(extra="allow")

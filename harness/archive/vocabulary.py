@@ -69,8 +69,8 @@ BRANCHES = {
         "reconcile_finalize": ("asked who follows", "recommitted, more to come", "done"),
     }.items()
 }
-"""Handler -> the branches that the handler can take, including those of wrong agents. This table repeats the names from
-the agent core, because the checker must not read them from the agent core that it judges.
+"""Handler -> the branches that the handler can take. Some branches occur only in agents with an error. The table
+repeats names of the agent core, because the checker must not depend on the agent core that it judges.
 """
 
 TIMER_OF = {

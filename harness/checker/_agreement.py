@@ -112,9 +112,10 @@ def describe_absent_agents(evidence: Evidence) -> str:
 
 
 def find_agents_with_chance(evidence: Evidence, differing: set[int]) -> set[int]:
-    """Return those of the `differing` agents that had a chance to agree. Such an agent completed a reconcile that began
-    after the network became fully connected and after the last change of any other chain. During the reconcile, all
-    judged agents ran without a pause, and no other agent ran.
+    """Return those of the `differing` agents that had a chance to agree. Such an agent completed a reconcile under
+    three conditions. The network was fully connected from the beginning of the reconcile. The chains of the other
+    agents did not change after this beginning. Until the end of the reconcile, no agent was paused, and exactly the
+    agents whose chains are judged were running.
     """
     since = evidence.connected_since_s
     if since is None:

@@ -68,8 +68,8 @@ def check(evidence: Evidence) -> Judgement:
 def _split_completed(evidence: Evidence) -> tuple[int, list[str]]:
     """Return the number of lost blocks, and the hashes of all other completed blocks.
 
-    A block counts as lost under two conditions: no present agent holds the block, and the agent that completed the
-    block was killed (Section 3.3 of the thesis), restarted or switched off.
+    A block is lost if two conditions are true. No present agent holds the block. The agent that completed the block was
+    killed (Section 3.3 of the thesis), restarted or switched off.
     """
     completed = evidence.completed_blocks()
     exports = evidence.present.values()

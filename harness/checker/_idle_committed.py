@@ -7,9 +7,8 @@ NAME = "idle implies committed"
 
 
 def check(evidence: Evidence) -> Judgement:
-    """Check two states of each agent: the exported state, and the state after each handler run. Return the verdict on
-    characteristic 2. The verdict is `not applicable` if an agent left no export, or was not idle when it wrote its
-    export.
+    """Return the verdict on characteristic 2. The check examines the state of each agent after each handler run, and in
+    its export. The verdict is `not applicable` if an agent left no export, or was not idle when it wrote its export.
     """
     findings = [*_check_exports(evidence), *_check_traces(evidence)]
     if findings:

@@ -46,8 +46,8 @@ a kind exceeds both limits, the agent probably interprets the trace format diffe
 
 def lost_lines(trace: Trace) -> dict[int, str]:
     """Return the places at which lines of the trace seem to be lost, each with a reason such as "lines are missing
-    ...". The key is the number of handler runs before the place, as in `Trace.gaps`. A lost line may explain an error
-    of the handler run after the place.
+    ...". The key is the number of handler runs before the place, as in `Trace.gaps`. A lost line may explain why the
+    handler run after the place seems to be wrong.
     """
     found: dict[int, str] = {}
     kinds = _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces(), _ContradictionPlaces()

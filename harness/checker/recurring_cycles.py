@@ -20,7 +20,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import MessageTrigger
 
 SEVERAL = 5
-"""Minimum number of consecutive repetitions of a sequence of handler runs that counts as a cycle."""
+"""A sequence of handler runs counts as a cycle if agents repeat it at least this number of times in a row."""
 LAST_RUNS = 20_000
 """Number of handler runs at the end of a trace in which the checker searches for a cycle. The limit bounds the time of
 the search.
@@ -37,8 +37,7 @@ ASKS = ("reconcile_phase_1", "reconcile_phase_2")
 MAX_NAMED = 10
 PERIOD_TOLERANCE_S = 0.01
 SHORTEST_PAUSE_S = 0.05
-"""Minimum number of mission seconds between two handler runs for which the description of a cycle mentions the
-pause.
+"""Shortest pause between two handler runs that the description of a cycle mentions, in mission seconds.
 """
 
 
@@ -161,8 +160,8 @@ def _key(run: HandlerRun) -> tuple[object, ...]:
 
 
 def _matches(keys: Sequence[object]) -> list[int]:
-    """Return the Z-function of a sequence. For each position, this is the length of the longest common prefix of the
-    whole sequence and the part that begins at this position.
+    """Return the Z-function of a sequence. For each position, the Z-function compares the sequence from this position
+    on with the beginning of the sequence, and counts the equal elements before the first difference.
     """
     matching = [0] * len(keys)
     left = right = 0

@@ -28,11 +28,9 @@ class TimerLag:
 
 
 def timer_lag(traces: Iterable[Trace], lag: MeasuredLag | None = None) -> TimerLag | None:
-    """Return the lateness of the vote timers of all agents. Votes that a reconcile interrupted do not count. Return
-    None for fewer than `ENOUGH` votes.
-
-    `lag` contains the measured delays of the machine. If it is given, only the lateness that these delays explain
-    counts.
+    """Return the lateness of the vote timers of all agents. Votes that a reconcile interrupted are ignored. Return None
+    for fewer than `ENOUGH` votes. `lag` contains the measured delays of the machine. If `lag` is given, the result
+    contains only the lateness that these delays explain.
     """
     late: list[float] = []
     asked_s = 0.0

@@ -44,8 +44,8 @@ class VariantError(HarnessError):
 
 @dataclass(frozen=True)
 class CoreChange:
-    """The handler with which a variant replaces one algorithm of the agents. The fields after `run` list possible
-    actions of the new handler that the original handler lacks, such as further messages that it sends.
+    """A new handler, which replaces one algorithm of the agents in a variant. The fields after `run` list actions that
+    only the new handler can make, such as sending further messages.
     """
 
     algorithm: int
@@ -175,8 +175,9 @@ class NumberedHandler(Protocol):
 
 @contextmanager
 def replaced(tables: list[MutableMapping[Any, Any]], new: Mapping[int, Callable[[Any], Any]]) -> Iterator[None]:
-    """Replace the handlers of these algorithms in all tables inside the context, and restore them at the end. Each
-    function in `new` receives the original handler and returns its replacement.
+    """Return a context manager that replaces handlers in all `tables`. At the end of the context, it restores the
+    original handlers. `new` maps the number of an algorithm to a function, which receives the original handler and
+    returns the new one.
     """
     before = [dict(table) for table in tables]
     made: dict[int, Any] = {}

@@ -206,8 +206,8 @@ class RadioLinks:
         return _hundredths_of_db(loss_db)
 
     def _age(self, now_ns: int) -> None:
-        """Replace the shadowing values, because time has passed. The longer the time and the movements since the last
-        change, the smaller is the part of the old values that remains.
+        """Change the shadowing values after some time has passed. After a long time or long movements, the new values
+        hardly depend on the old ones.
         """
         elapsed_s = (now_ns - self._shadowed_at) / NANOSECONDS
         self._shadowed_at = now_ns

@@ -47,7 +47,7 @@ class Radio:
             _check(field.name, getattr(self, field.name))
 
     def airtime_ns(self, data_bytes: int) -> int:
-        """Return the time in nanoseconds for which a message with this number of data bytes occupies the channel."""
+        """Return how long a message with this number of data bytes occupies the channel, in nanoseconds."""
         raise NotImplementedError
 
 

@@ -68,7 +68,9 @@ class PublicKeys:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Parse the content of `public.json`. Raises KeyFileError without the file's name."""
+        """Parse the content of `public.json`. Raises KeyFileError. The error message does not contain the name of the
+        file.
+        """
         depot = None if document.get("depot") is None else key_in(document, "depot", KEY_BYTES)
         if depot is not None and not _can_seal_to(depot):
             raise KeyFileError("`depot` is not a usable X25519 public key")
@@ -121,7 +123,9 @@ class Bundle:
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Parse the content of a bundle's file. Raises KeyFileError without the file's name."""
+        """Parse the content of a key bundle's file. Raises KeyFileError. The error message does not contain the name of
+        the file.
+        """
         public = PublicKeys.from_json(document)
         agent_id, epoch = document.get("agent_id"), document.get("epoch")
         if type(agent_id) is not int or agent_id not in public.vehicles:

@@ -45,8 +45,8 @@ class Captures(NamedTuple):
 
 
 def capture_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the capture files at `paths`: the paths that are files, and the captures in run directories and
-    directories of captures. Each file is listed once.
+    """Return the capture files at `paths`. A path is a capture file, a run directory, or another directory with
+    captures. The result contains each file once.
 
     Raises RunDirectoryError if a path does not exist, or a directory contains no capture.
     """

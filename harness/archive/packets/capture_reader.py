@@ -168,8 +168,8 @@ class MessageSummary(NamedTuple):
 
     @property
     def request_key(self) -> tuple[str, bytes | None] | None:
-        """The type and the subject of an answer to this request. If they equal `answers` of another message, this
-        message may be the answer. None if the message is not a request. The agent that sent the request is not
+        """The type and the subject of an answer to this request. Another message may be the answer if its attribute
+        `answers` has the same value. None if the message is not a request. The agent that sent the request is not
         included, because answers do not name this agent.
         """
         response = RESPONSES.get(self.message)
@@ -182,8 +182,8 @@ class MessageSummary(NamedTuple):
 
     @property
     def _subject(self) -> bytes | None:
-        """The chain or block about which a request asks and its answer informs. A Next In Sequence response also names
-        the found block, but its request names only the chain.
+        """The chain or block that the message concerns. A request and its answer concern the same chain or block. The
+        subject of a Next In Sequence response is the chain, because its request does not name the found block.
         """
         return self.chain_hash if self.message == NextInSequenceResponse.NAME else self.block_hash or self.chain_hash
 

@@ -72,11 +72,12 @@ class DatagramRecord(BaseModel):
     """One datagram, sent once. `number` is its position in the order of sending. `answers` is null if the message is
     not a request.
 
-    `origin` is `captured` (the capture of the sender contains the datagram), `inferred` (the sender was not captured at
-    that time, and `at_s` is the time of the first reception) or `forged` (the agent that the datagram names as its
-    sender did not send it). The vehicles in `lost_by` were captured but did not receive the datagram. The vehicles in
-    `not_listening` were not captured. `loss_reasons` lists vehicles of `lost_by` by the reason why the shared channel
-    lost the message. The key is missing without such a loss.
+    `origin` is `captured` (the capture of the sender contains the datagram), `inferred` (the sender captured no packets
+    at that time, so `at_s` is the time of the first reception) or `forged` (the agent that the datagram names as its
+    sender did not send it). `lost_by` lists vehicles that captured packets at that time but did not receive the
+    datagram. `not_listening` lists vehicles that captured no packets at that time. `loss_reasons` maps each reason for
+    which the shared channel lost the message to vehicles in `lost_by`. Without such a loss, the key `loss_reasons` is
+    missing.
     """
 
     number: int

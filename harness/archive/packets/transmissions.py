@@ -20,8 +20,8 @@ from harness.archive.run_journals import CHANNEL_FILE, ChannelLine
 
 Origin = Literal["captured", "inferred", "forged"]
 """The origin of a transmission. `captured` means that the capture of the sender contains the transmission. `inferred`
-means that the sender was not captured at that time, so `at_s` is the time of the first reception. `forged` means that
-the agent that the datagram names as its sender did not send it.
+means that the sender captured no packets at that time, so `at_s` is the time of the first reception. `forged` means
+that the datagram names a sender that did not send it.
 """
 
 

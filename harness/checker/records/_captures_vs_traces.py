@@ -71,9 +71,9 @@ def _seen(captures: Captures) -> tuple[dict[int, Datagrams], dict[int, Datagrams
 
 
 def _not_sent(evidence: Evidence, agent_id: int) -> int:
-    """Return the maximum number of messages in the agent's trace that the agent never sent.
+    """Return the number of messages in the agent's trace that the agent perhaps never sent. There are three causes.
 
-    Sending may have failed. A killed agent does not send the messages of its last handler run. An agent that ends does
+    A send may have failed. A killed agent does not send the messages of its last handler run. An agent that ends does
     not send the answers that it had delayed.
     """
     recorded = evidence.recorded(agent_id)

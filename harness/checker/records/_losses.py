@@ -138,8 +138,9 @@ class _LossHistory:
         return found
 
     def _around(self, values: list[float], first: int, end: int) -> list[float]:
-        """Return the values that may have been in effect at a time with a tolerance. `values` is in order of time.
-        `first` values took effect before the tolerance interval, and `end` values before the end of the interval.
+        """Return the values that may have been in effect during an interval. `values` is sorted by time. `first` is the
+        number of values that took effect before the beginning of the interval. `end` is the number of values that took
+        effect before the end of the interval.
         """
         first = max(0, first - 1)
         return values[first : max(first + 1, end)]
@@ -282,7 +283,9 @@ class _ReadyTimes:
         self._end_s = evidence.end_of(agent_id) or 0.0
 
     def handles(self, sent_s: float) -> bool:
-        """Return true if the agent handles a message that was sent at `sent_s`, whatever its latency."""
+        """Return true if the agent handles a message that was sent at `sent_s`, with the shortest and with the longest
+        latency.
+        """
         arrives_s = sent_s + self._latest_s
         if arrives_s >= self._end_s:
             return False

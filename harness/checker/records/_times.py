@@ -79,7 +79,9 @@ def _compare_export(
 
 
 def _has_recorded_events(evidence: Evidence) -> bool:
-    """Return true if the events have the timestamps of an earlier, recorded run, and not the times of their logging."""
+    """Return true if the events may have timestamps from a recording. The timestamps then differ from the times at
+    which the agents logged the events.
+    """
     return evidence.scenario is None or any(event.timestamp_us is not None for event in evidence.scenario.events.script)
 
 

@@ -424,8 +424,8 @@ def reconcile_finalize(state: ReferenceState) -> str:
 
 
 def tally_of(state: ReferenceState, handler: Handler) -> Tally | None:
-    """Return the counters of a handler: a copy of its votes or candidates, or the candidate that it chose. Hashes are
-    hexadecimal text. Return None for a handler that counts nothing.
+    """Return a copy of the votes or candidates that a handler counts. If the handler chooses a candidate, return only
+    this candidate. Hashes are hexadecimal text. Return None for a handler that counts nothing.
     """
     dictionary = state.reconcile_response_dictionary
     if handler.tally == "majority_response_block_hash":

@@ -147,8 +147,8 @@ class AdoptingCore(_Core):
         """Undo the changes that the last step made to blocks and timers. The votes are not restored, because `adopt`
         replaces them.
 
-        `before` contains the data that the method `before` returned. It is None if the recorded changes are sufficient
-        to undo the step.
+        The argument `before` is the result of the method `before`. It is None if the recorded changes are sufficient to
+        undo the step.
         """
         for operation, block_hash in reversed(self.changes):
             match operation:

@@ -21,7 +21,9 @@ from harness.checker.steps.trace_header import ROUNDING_S
 SINGLE_WALL_S = 0.03
 """Maximum lateness of a single timer in addition to the measured delay, in seconds of wall time."""
 MEAN_WALL_S = 0.01
-"""Maximum mean lateness of one timer's expiries in addition to the mean measured delay, in seconds of wall time."""
+"""Tolerance for the mean lateness of a timer, in seconds of wall time. The mean lateness may exceed the mean measured
+delay by this time.
+"""
 ENOUGH = 8
 """Minimum number of expiries for which a mean is computed."""
 
@@ -47,7 +49,9 @@ class JudgedTimers:
     def judge(
         self, evidence: Evidence, trace: Trace, expiries: Sequence[RecordedTimerExpiry]
     ) -> Iterator[StepDeviation]:
-        """Yield the expiries of an agent's timers that were later than the measured delays of the machine explain."""
+        """Yield the expiries of an agent's timers that were too late. The measured delays of the machine do not explain
+        how late these expiries were.
+        """
         agent_id, speedup = trace.header.agent_id, trace.header.clock.get("speedup")
         if in_virtual_time(trace):
             yield from _in_virtual_time(evidence, agent_id, expiries)

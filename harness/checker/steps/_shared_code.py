@@ -42,8 +42,8 @@ know the roster, the list of all agents.
 
 @cache
 def edited() -> tuple[str, ...]:
-    """Return the edited files among those that the judge shares with the agents, such as "ucp/trace.py". The file with
-    the settings is included.
+    """Return the shared files that a user has edited, such as "ucp/trace.py". Shared files contain the code that judge
+    and agents share. The file with the settings also counts as shared.
     """
     checked = {f"ucp/{name}.py" for name in (*SHARED, "settings")}
     return tuple(file for file in edited_files() if file in checked)

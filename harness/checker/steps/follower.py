@@ -30,8 +30,8 @@ from ucp.trigger import BootTrigger, EventTrigger, LocalTrigger, MessageTrigger,
 EVENT_OF = {handler.name: event for event, handler in ON_LOCAL_EVENT.items()}
 
 COUNTING = frozenset(("proposed", "asked", "yes", "no", "new candidate", "counted", "block", "tie: block"))
-"""Branches (results of a handler) after which the votes or answers that the agent has counted are compared. Other
-handler runs do not use these counts.
+"""Branches (results of a handler) that depend on counted votes or answers. Only after these branches, the comparison
+includes the counts.
 """
 
 LOGS = ON_LOCAL_EVENT["Build Data Block"].name

@@ -83,7 +83,7 @@ COUNTS = frozenset(ON_MESSAGE[kind].name for kind in (BlockAddResponse, ChainCon
 _MESSAGES = {handler.name: kind.NAME for kind, handler in ON_MESSAGE.items()}
 """Name of a handler of messages -> the type of its messages."""
 MAX_LOCAL = 4
-"""Maximum number of consecutive lost lines that local events triggered."""
+"""Maximum number of consecutive lost lines about handler runs that local events triggered."""
 
 
 def damage_that_explains(
@@ -121,8 +121,8 @@ def damage_that_explains(
 def _agrees(
     follower: StepComparer, lines: Sequence[Line], others: OtherRecords | None = None, lost: int = MAX_FURTHER
 ) -> bool:
-    """Return true if the reference agrees with the lines. If `others` is given, up to `lost` further lines may be
-    missing between the lines.
+    """Return true if the reference agrees with the lines. If `others` is given, the reference may add up to `lost`
+    handler runs whose lines were lost.
 
     The comparison ends early, with the result true, at a block whose recorded events differ from the logged events.
     Another lost line may be the cause of this difference.
@@ -344,7 +344,7 @@ def _completes_unknown_block(before: StepComparer, deviation: StepDeviation, run
 
 
 def _with_a_line_more(before: StepComparer, run: HandlerRun, others: OtherRecords) -> Iterator[StepComparer]:
-    """Yield copies of the reference, each after one additional handler run. Each one is a guess at the handler run on a
+    """Yield copies of the reference. Each copy has made another additional handler run, which may be the one on the
     lost line.
     """
     yield from _with_local_events_more(before, run)

@@ -12,8 +12,8 @@ from harness.checker.reference.state import Settings
 from ucp.block import MAX_AGENT_ID, MAX_EVENT_DATA_BYTES
 
 EARLY_WALL_S = 0.001
-"""Number of seconds of wall time by which a timer may seem to expire early. It is above 0 because an agent may read its
-clock when it starts a timer, and again for the trace line.
+"""Tolerance for early expiries of timers, in seconds of wall time. A timer may seem to expire early, because the agent
+may read its clock when it starts the timer, and again for the trace line.
 """
 ROUNDING_S = 2e-3
 """Rounding error in seconds of times in a trace, which may be rounded to milliseconds."""

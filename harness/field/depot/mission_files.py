@@ -101,7 +101,9 @@ class MissionPlan:
     """
     addresses: Mapping[int, str] = field(default_factory=dict)
     broadcast: str | None = None
-    """The broadcast address. If it is None, the address is computed from `subnet`, or equals the address in a run."""
+    """The broadcast address. If it is None, the mission has the broadcast address of `subnet`. Without `subnet`, the
+    mission has the same broadcast address as a run.
+    """
     port: int = PORT
     secured: bool = False
     """True if the directory of each mission file also contains the key bundle of the vehicle."""

@@ -1,4 +1,4 @@
-"""Find out which agent flew on the vehicle of each flight log, by comparing times and positions. Summarise the log.
+"""Find the agent of each flight log by comparing times and positions. Also summarise each flight log.
 
 An agent logs positions of its vehicle as events, and the flight log has the same positions more densely. Both come from
 the same messages of the autopilot. A moving vehicle therefore passes each place at a known time on the agent's clock,
@@ -97,8 +97,8 @@ def match_logs(logs: Iterable[FlightLog], agents: Mapping[int, Fixes]) -> list[M
 
 
 def _other_flight(match: MatchedLog, nearest: Mapping[int, float]) -> MatchedLog:
-    """Return the match. If another log with the same path is nearer to the agent's clock, this log is from another
-    flight. The returned match then has no agent.
+    """Check a match against other logs with the same path, and return it. If the time of another log is closer to the
+    agent's clock, the log of this match is from another flight. The returned match then has no agent.
     """
     if match.agent_id is None or match.clock_ahead_s is None:
         return match

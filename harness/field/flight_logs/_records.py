@@ -124,8 +124,8 @@ class Parameter(NamedTuple):
 
 
 class ClockJump(NamedTuple):
-    """A jump of the log's clock. The jump is recorded when two records have new times that are consistent with each
-    other but not with the old time.
+    """A jump of the log's clock. One record with an unexpected time is not yet a jump, because its time may be damaged.
+    The reader records a jump when the time of the next record confirms the new time.
 
     The cause may be a restart of the autopilot, a correction of the computer's clock, or a pause of the log. The log
     does not show which. Only if the time decreases, the clock was certainly wrong.

@@ -86,8 +86,8 @@ def read_public_keys(path: Path, left_out: list[UnusedPart]) -> "PublicKeys | No
 def assign_keys(
     flights: Sequence[Flight], found: Sequence[tuple[Path, "PublicKeys"]], left_out: list[UnusedPart]
 ) -> None:
-    """Assign public keys to each flight: the keys with which a signature in the exports of this flight is valid. If any
-    flight has signed blocks, keys without a valid signature belong to another mission and are omitted.
+    """Assign public keys to each flight. Keys belong to a flight if they verify a signature in the exports of the
+    flight. If any flight has signed blocks, keys that verify no signature belong to another mission and are omitted.
     """
     signed = {id(flight): [*_signed(flight)] for flight in flights} if found else {}
     unused = dict(found)

@@ -261,8 +261,9 @@ MAX_DRIFT = 0.05
 
 
 def _drift(incarnation: TraceIncarnation) -> float:
-    """Return the drift of an agent's clock. The drift is computed from the timer that expired earliest in proportion to
-    its duration. Without timers, the drift is 0.
+    """Return the drift of an agent's clock. For each timer, the duration of the timer is divided by the time until its
+    expiry. The drift is the largest quotient minus 1. It is 0 if no timer expired, or if the result exceeds
+    `MAX_DRIFT`.
     """
     started: dict[str, tuple[float, float]] = {}
     drifts = []

@@ -37,8 +37,8 @@ MAX_BYTES_BEFORE_TRACE, MAX_LINES_BEFORE_TRACE = 8 * 1024 * 1024, 100_000
 is not a trace.
 """
 ROUNDING_S = 2e-3
-"""Maximum number of seconds by which the time of a line may be earlier than the time of the previous line. Such
-differences occur because times may be rounded to milliseconds.
+"""Tolerance in seconds for a line whose time is earlier than the time of the previous line. Such times occur because an
+agent may round times to milliseconds.
 """
 FAR_AHEAD_S = 3600.0
 """Maximum number of seconds between two handler runs of an incarnation. No agent is idle for longer."""

@@ -140,8 +140,9 @@ class SoloSimulations:
         return [*self._remarks, inferred]
 
     def rehearse(self, header: CheckedHeader) -> None:
-        """Simulate an agent with the inputs in its trace, or with the inputs that the capture of its vehicle shows.
-        Store the simulation that explains more inputs in `rehearsals`.
+        """Simulate an agent with the inputs in its trace, and store the simulation in `rehearsals`. If the trace is
+        missing, or the simulated agent does not reach the exported chain although it never deviates, also simulate the
+        agent with the inputs in its vehicle's capture. In this case, store the simulation with more inputs.
         """
         agent_id = header.agent_id
         rehearsal = self._by_trace(header) if agent_id in self._flight.traces else None

@@ -212,9 +212,9 @@ def _next_combination(deferred: dict[int, int], choices: Sequence[int]) -> bool:
 
 
 class _InputSequence:
-    """One possible order of the inputs of an agent between two restarts. At first, each timer expires at its most
-    likely position among the other inputs. `deferred` maps the number of a timer to the number of inputs by which its
-    expiry is moved from this most likely position.
+    """One possible order of the inputs of an agent between two restarts. Each timer expires at its most likely position
+    among the other inputs, unless `deferred` moves the expiry to a later position. `deferred` maps the number of a
+    timer to the number of positions by which its expiry is moved.
     """
 
     def __init__(

@@ -186,7 +186,9 @@ TRIES = 10
 def likely_settings(
     other_records: OtherRecords, captures: dict[int, AgentCapture], header_of: Callable[[int, Settings], CheckedHeader]
 ) -> Settings:
-    """Return the settings with which the packet captures explain the most agents completely."""
+    """Return the settings that best fit the packet captures. With these settings, the inferred inputs completely
+    explain the captures of the most agents.
+    """
     events = {agent_id: other_records.events(agent_id) for agent_id in captures}
 
     def explained(settings: Settings) -> tuple[int, int]:

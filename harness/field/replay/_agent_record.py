@@ -222,8 +222,8 @@ class RecordedTrace:
 
     @cached_property
     def present_until_s(self) -> float | None:
-        """A mission second after the last line until which the agent certainly ran. The value is None if no such time
-        is known. If a step was due before this time and has no line, this line was lost.
+        """A mission second at which the agent certainly still ran after its last trace line. None if no such time is
+        known. If a step was due before this time, but the trace has no line for the step, the line was lost.
         """
         if self.trace.cut_off or self.trace.problem or self.agent_id not in self.flight.exports:
             return None

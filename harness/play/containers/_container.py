@@ -197,7 +197,7 @@ def recipe(
     limits: DockerOptions,
     max_file_bytes: int | None = None,
 ) -> dict[str, Any]:
-    """Return the keyword arguments with which the Docker SDK creates a container for a program.
+    """Return the keyword arguments that let the Docker SDK create a container for a program.
 
     The container has no capabilities. It can write only into /tmp and the directories in `kept`.
     """

@@ -45,8 +45,8 @@ MAX_ANSWER_BYTES = 1024
 READ_BYTES = 1 << 16
 FILE_BYTES = 1 << 18
 MAX_UNSENT_BYTES = 1 << 20
-"""Number of bytes waiting to be sent to the lab. Above this number, the worker reads no further output and no further
-files of vehicles.
+"""Limit for the data that wait to be sent to the lab, in bytes. Above this limit, the worker reads no further output
+and no further files of vehicles.
 """
 MAX_WAITING_BYTES = 1 << 16
 """Number of bytes waiting to be sent to a slow vehicle. Above this number, further data for this vehicle are

@@ -1,4 +1,4 @@
-"""Keep the program of one vehicle on a worker, as the first process of the vehicle's network.
+"""Start and control the program of one vehicle on a worker. This process is the first process of the vehicle's network.
 
 The end of this process ends each process that the vehicle started. `harness.play.hosts._vehicle_host` sends requests
 through a socket, as JSON objects in one packet each. The first request starts the program. Later requests send a signal

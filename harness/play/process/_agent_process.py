@@ -76,8 +76,8 @@ class _ProcessIncarnation:
     killed: bool = False
     """True if the incarnation ended by SIGKILL and its disk was not kept."""
     switched_off: bool = False
-    """True if the incarnation ended by SIGTERM. After the last status, only the files of the incarnation show its
-    actions.
+    """True if the incarnation ended by SIGTERM. Only the files of the incarnation then show its actions after its last
+    status.
     """
     reboot: bool = False
     """True if the incarnation started with the data on the agent's disk."""

@@ -204,7 +204,7 @@ class ChannelNode:
 
 
 class DeliveryLateness:
-    """A record of the lateness with which the channel delivered frames, in mission seconds."""
+    """A record that shows how late the channel delivered frames, in mission seconds."""
 
     def __init__(self) -> None:
         self.missed = 0

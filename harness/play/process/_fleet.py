@@ -44,8 +44,9 @@ class Fleet:
         watchers: MissionTasks,
         lost_worker: Callable[[int], str | None] | None = None,
     ) -> None:
-        """Create the vehicles without starting them. If vehicles run on a cluster, `lost_worker` receives the ID of a
-        vehicle. It returns the address of the worker that ran the vehicle if this worker is lost, and otherwise None.
+        """Create the vehicles without starting them. On a cluster, `lost_worker` is a function with the ID of a vehicle
+        as its argument. If the worker that ran this vehicle is lost, the function returns the address of the worker.
+        Otherwise the function returns None.
         """
         self._scenario = scenario
         self._kinds = kinds

@@ -1,5 +1,5 @@
-"""Start, stop and query a program in a virtual network that answers commands on a control socket. The program is an
-agent, or a node of the harness.
+"""Start, stop and query a program that runs in a virtual network. The program is an agent or a node of the harness, and
+answers commands on a control socket.
 
 The consequence of a failure depends on the caller: a mission ends, a conformance case fails, and a bisection skips the
 program. This module therefore only reports failures, in errors of its own. Each caller converts these errors to its own
@@ -20,7 +20,7 @@ from harness.play.process.lab_program import LabProgram
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
-"""Seconds of wall time without an answer after which a program counts as hung."""
+"""A program counts as hung if it sends no answer for this number of seconds of wall time."""
 STOP_GRACE_S = 5.0
 RETRY_S = 0.02
 END_LIMIT_S = 0.5

@@ -2,7 +2,7 @@
 
 A stand-in is the local program that represents such an agent. Runs (`_remote_agents`) and conformance tests
 (`agent_pool`) use this module through the interface `Host`. The host decides which far ends it accepts, and which
-stand-in gets which connection.
+stand-in receives each connection.
 """
 
 from __future__ import annotations

@@ -195,9 +195,9 @@ NUMBER_BYTES = 4
 requests.
 """
 SILENT_S = 2.0
-"""Seconds of wall time without a ping or pong after which a vehicle counts as cut off."""
+"""A vehicle counts as cut off if no ping or pong arrives for this number of seconds of wall time."""
 LOST_AFTER_S = 10.0
-"""Seconds of wall time without an acknowledgement after which the kernel closes a connection."""
+"""The kernel closes a connection if the other end acknowledges no data for this number of seconds of wall time."""
 
 
 def prepare(connection: socket.socket) -> None:

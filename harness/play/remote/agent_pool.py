@@ -25,11 +25,13 @@ from harness.play.remote._remote_program import RemoteProgram
 from harness.play.remote._stand_in_task import StandInTask
 
 PLACES = 12
-"""Maximum number of incarnations that run at the same time. A small computer has less memory and fewer cores than the
-computer of the harness.
+"""Maximum number of incarnations that run at the same time. The number is small, because a far computer may have less
+memory and fewer cores than the computer of the harness.
 """
 WAIT_LIMIT_S = 10.0
-"""Seconds of wall time for which a stand-in waits for a connection. After this time, the far end counts as ended."""
+"""Maximum time that a stand-in waits for a connection, in seconds of wall time. After this time, the far end counts as
+ended.
+"""
 MAX_DELAY_S = 0.02
 """Maximum delay of the connection in one direction, in seconds of wall time. With a longer delay, answers would come
 too late for timers of a test, some of which expire after 0.2 s.

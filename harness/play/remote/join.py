@@ -41,12 +41,12 @@ if TYPE_CHECKING:
 CONNECT_LIMIT_S = 5.0
 RETRY_S = 1.0
 REJOIN_LIMIT_S = 60.0
-"""Seconds of wall time without a connection after which the incarnation of the agent ends."""
+"""The incarnation of an agent ends if the agent has no connection for this number of seconds of wall time."""
 MAX_PLACES = 32
 DIRECTORY = "ucp-join-"
 NEW_S = 60.0
-"""Age in seconds from which a directory without a lock counts as the directory of a killed process. A younger directory
-may be new and not yet locked.
+"""Minimum age in seconds of a directory that may be removed. An older directory without a lock belongs to a killed
+process. A younger directory may be new and not yet locked.
 """
 
 

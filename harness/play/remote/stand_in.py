@@ -296,7 +296,7 @@ class StandIn:
     # Cut off
 
     def _cut(self) -> None:
-        """Record that the far computer does not respond. From now on, this program answers requests in place of the
+        """Record that the far computer does not respond. From now on, this program itself answers the requests to the
         agent.
         """
         if self._cut_off or not self._begun or self._over.done():  # after its last message, the far end disconnects

@@ -126,7 +126,9 @@ class EventLoop:
         """Messages for a rogue node that may start later in the run, or None if no rogue node can start."""
         self._sought: SoughtRun | None = None
         self._found: int | None = None
-        """The ID of the agent that ran the handler for which the caller waits, or None if no agent has run it yet."""
+        """The caller may wait until an agent runs a certain handler. This is the ID of the agent that ran the handler,
+        or None if no agent has run it yet.
+        """
         self._stopped_within_instant = False
         """True if the last call of `run` stopped at the handler run for which the caller waited. Further inputs of the
         same time may remain.
@@ -309,9 +311,9 @@ class EventLoop:
         self._finish_input(number, incarnation)
 
     def _tally_answers(self, number: int, incarnation: SimulatedIncarnation) -> None:
-        """Pass the answers that have arrived, and that the agent only counts, to the agent. The loop calls this method
-        before a handler reads the number of answers. If a trace is written, the loop also calls it before other inputs,
-        so that the lines of the trace are in order.
+        """Let the agent count the answers that have arrived and are not counted yet. The loop calls this method before
+        a handler reads the number of answers. If a trace is written, the loop also calls it before other inputs, so
+        that the lines of the trace are in order.
         """
         agent, state = incarnation.agent, incarnation.state
         if state is None or incarnation.waiting is not None or not self._air.open_queries[number]:

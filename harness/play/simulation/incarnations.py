@@ -1,4 +1,6 @@
-"""Represent agents in virtual time between a start and an end, and name the blocks that they complete."""
+"""Represent incarnations of simulated agents, and name the blocks that the agents complete. An incarnation is the time
+of an agent between a start and the next end.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -22,8 +22,8 @@ FLIGHT = ("vehicles", "flight", "network.radio")
 distance.
 """
 NEVER_IN_BURSTS = {"p": 0.0, "r": 1.0}
-"""Parameters with which the model of burst losses never loses a message. The model then draws the same random numbers
-as with losses.
+"""Parameters for the model of burst losses. A model with these parameters never loses a message, but still draws the
+same random numbers as before.
 """
 
 
@@ -57,8 +57,8 @@ def at(document: Document, key: str) -> Any:
 
 
 def with_script(document: Document, logged: list[RecordedEvent], drops: list[Document]) -> Document:
-    """Replace all random parts of the document. In the new document, agents log exactly these events, and the network
-    loses exactly these messages.
+    """Return a document without random parts. In this document, agents log exactly the events in `logged`, and the
+    network loses exactly the messages that match the rules in `drops`.
     """
     script = [event_of(event) for event in logged]
     document = _without_flight(document)
@@ -94,11 +94,9 @@ def fate_by_count(lost: LostMessage) -> Document:
 
 
 def fate_by_time(lost: LostMessage, slack_s: float) -> Document:
-    """Return a rule with which the network loses all messages of this type from this sender to this receiver at about
-    this time.
-
-    The rule identifies its message by a time and not by a number. The rule therefore still matches the same message
-    when other messages disappear from the run.
+    """Return a rule that lets the network lose all messages of this type from this sender to this receiver at about
+    this time. The rule contains no number of a message, so it still matches the intended message if earlier messages
+    disappear from the run.
     """
     window = {"from_s": max(0.0, round(lost.at_s - slack_s, 3)), "until_s": round(lost.at_s + slack_s, 3)}
     return {"message": lost.message, "sender": lost.sender, "receiver": lost.receiver, **window, "drop": True}
@@ -224,8 +222,8 @@ def _entry(entry: Document, kept: Collection[int]) -> Document | None:
 
 
 def _datagram(datagram: Document, kept: Collection[int]) -> Document:
-    """Return an injected datagram that only has kept agents as receivers. If its source is an agent that is not kept,
-    return it without receivers.
+    """Return an injected datagram, and remove receivers that are not in `kept`. If the source of the datagram is not in
+    `kept`, remove all receivers.
     """
     from_kept = datagram["source"] in kept
     reaches = {agent: at_s for agent, at_s in datagram["reaches"].items() if from_kept and int(agent) in kept}

@@ -54,8 +54,8 @@ class AwayRun:
 
 @dataclass(frozen=True)
 class AwayPlayer:
-    """A function that carries out a run in a worker of a Dask cluster. `play` is the function that carries out a run on
-    the machine on which it is called.
+    """A function that carries out a run in a worker of a Dask cluster. The function calls `play` on the computer of the
+    worker.
     """
 
     play: RunPlayer

@@ -89,7 +89,7 @@ class Comparison(BaseModel):
     culprits: list[Culprit] = []
     """The commits that made numeric results worse, if a search for them was requested."""
     not_compared: list[str] = []
-    """A sentence for each difference between the two matrices because of which some cells cannot be compared."""
+    """A sentence for each difference between the two matrices that prevents the comparison of some cells."""
 
     @property
     def regressions(self) -> list[Change]:

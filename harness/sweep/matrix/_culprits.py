@@ -1,5 +1,5 @@
-"""Find the commits that made a numeric result worse. The search plays one run with the code of commits between the
-earlier night and this night.
+"""Find the commits that made a numeric result worse. The search plays the same run with different commits of the code.
+These commits were made between the earlier night and this night.
 
 A run in virtual time is always the same, so one run is enough. The search uses the run whose result became worse by the
 largest amount. A binary search finds the first commit with a different result. If a later commit changed the result

@@ -60,8 +60,8 @@ def informative(
 
 
 def _information(point: MatrixPoint, runs: Mapping[MatrixTask, Run], begun: int) -> float:
-    """Return the expected benefit of a further run of this cell: the probable width of its widest confidence interval
-    when all runs that have begun have ended.
+    """Return the expected benefit of a further run of this cell. The benefit is the probable width of the cell's widest
+    confidence interval after the end of all runs that are in progress.
     """
     if begun < _FIRST_RUNS:
         return float(2 * _FIRST_RUNS - begun)

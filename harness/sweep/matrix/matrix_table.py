@@ -227,8 +227,9 @@ def _say_culprit(culprit: Culprit) -> Iterable[str]:
 
 
 def _first_changes(changed: ChangedRuns) -> str:
-    """Return a phrase about the first changed handler run of each run: the names of the handlers, and the run whose
-    change is the earliest. Return an empty text if no handler is known.
+    """Return a phrase about the first difference between each run and the same run of the earlier night. The phrase
+    contains the handlers that ran differently, and the place of the earliest difference. Return an empty text if no
+    handler is known.
     """
     known = [each for each in changed.first if each.handler is not None]
     if not known:

@@ -132,7 +132,7 @@ class RecordedMission:
         self._exchange({"timer": True})
 
     def command(self, name: str, *, after_s: float = 0.5, **keys: Any) -> None:
-        """Give the agent a command, as over its control socket, or the command `store`."""
+        """Send a command to the agent: a command of the control socket, or the command `store`."""
         self.now += after_s
         self._exchange({"command": name, **keys})
 

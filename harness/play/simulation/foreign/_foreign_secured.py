@@ -1,4 +1,6 @@
-"""Run a foreign agent with keys. The harness decrypts its datagrams for the records, and delivers them unchanged."""
+"""Run a foreign agent that signs and encrypts its messages. The harness delivers the agent's datagrams unchanged. It
+decrypts a copy of each datagram for the records.
+"""
 
 import re
 from collections.abc import Iterator

@@ -24,7 +24,7 @@ from harness.play.simulation.foreign._answer import Outcome
 
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
-"""Seconds of wall time without an answer after which a program counts as hung. The first answer may take
+"""A program counts as hung if it sends no answer for this number of seconds of wall time. The first answer may take
 `START_LIMIT_S`.
 """
 MAX_ANSWER_BYTES = MAX_EXPORT_BYTES

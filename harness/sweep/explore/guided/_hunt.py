@@ -107,8 +107,8 @@ class KeptRun:
 
     @property
     def nearness(self) -> float:
-        """The expected benefit of changed copies if the hunt searches for an endless cycle. It grows with the number of
-        failed votes in the run. It is 0 if the run had no new pattern of failed votes.
+        """The expected benefit of playing changed copies of this scenario, if the hunt searches for an endless cycle.
+        The value grows with `failed`. It falls with the number of earlier copies and with the length of the run.
         """
         return self.failed**2 / (1 + self.picked) / (100 + self.steps)
 

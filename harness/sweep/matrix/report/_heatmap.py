@@ -145,8 +145,8 @@ def heatmap(record: MatrixRecord, figure: HeatmapFigure) -> Heatmap:
 
 
 def _scale(figure: HeatmapFigure, record: MatrixRecord) -> tuple[float, float]:
-    """Return the two values that get the first and the last shade. They are 0 and 1 if the numeric result is a share.
-    Otherwise, they are the smallest and the largest mean.
+    """Return the two values that the first and the last shade stand for. They are 0 and 1 if the numeric result is a
+    share. Otherwise, they are the smallest and the largest mean.
     """
     if figure.metric.unit != "number":
         return 0.0, 1.0
