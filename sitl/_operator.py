@@ -13,8 +13,8 @@ MOST_COMMANDS = 1000
 """Maximum number of recorded commands. Further commands are only counted."""
 
 _ASKS_ONLY = re.compile(r"MAV_CMD_(REQUEST_|GET_|SET_MESSAGE_INTERVAL$|RUN_PREARM_CHECKS$|DO_SEND_BANNER$)")
-"""Matches names of commands that only request data from a vehicle. Ground stations send them automatically, so they are
-not recorded.
+"""A pattern for the names of commands that only request data from a vehicle. Ground stations send these commands
+automatically, so the commands are not recorded.
 """
 
 _AT_THE_STICKS = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})

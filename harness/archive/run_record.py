@@ -415,7 +415,7 @@ class RemoteRecord(_RecordModel):
         """Return the maximum difference between the mission times of the agent and of the harness, in seconds of wall
         time, in a run that lasted `lasted_s` seconds.
 
-        A fault reaches the agent late by the delay of the connection, which therefore counts, too.
+        The result includes the delay of the connection, because a fault reaches the agent with this delay.
         """
         drift = UNKNOWN_DRIFT if self.drift is None else abs(self.drift)
         return (self.uncertainty_s or 0.0) + drift * lasted_s + (self.delay_most_s or 0.0)
@@ -668,7 +668,8 @@ class RunRecord(JudgedRecord):
         self, chains: Mapping[int, Sequence[str]], top_chain_hashes: Mapping[int, str]
     ) -> Iterator[tuple[str, list[str]]]:
         """Yield each kind of expectation except verdicts, with a sentence for each unmet expectation of this kind.
-        `chains` has the block hashes of each agent's chain, and `top_chain_hashes` has its top chain hash.
+        `chains` contains the block hashes of each agent's chain. `top_chain_hashes` contains the top chain hash of each
+        agent.
         """
         found = [(finding.agent_id, finding.handler) for finding in (self.steps.evidence if self.steps else ())]
         figures: dict[str, float | None] = {name: self.figures.get(name) for name in self.expect.figures}

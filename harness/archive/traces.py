@@ -219,7 +219,7 @@ class Trace:
     def skimmed(self) -> "Trace":
         """Return the trace without the handler runs that only received a message.
 
-        The line numbers that `incarnations` yields are wrong in the result.
+        Do not use line numbers of the returned trace, because its method `incarnations` yields wrong ones.
         """
         kept = [not only_receives(run) for run in self.runs]
         before = [0, *accumulate(kept)]

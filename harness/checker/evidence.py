@@ -110,8 +110,8 @@ class RogueTraffic:
     counted: bool = False
     """True if some lines of the log contain only a number of messages. Any message can then be an injected one."""
     outside_senders: set[int] = field(default_factory=set)
-    """Agents in whose name the scenario delivers datagrams from outside of the swarm. The records of these senders are
-    missing.
+    """Senders of the datagrams that the scenario itself delivers. No agent of the scenario sends these datagrams, so
+    the traces of their senders may be missing.
     """
 
     def add(self, datagrams: Iterable[InjectedDatagram]) -> "RogueTraffic":

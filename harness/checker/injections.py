@@ -36,8 +36,8 @@ Count = Annotated[int, Field(ge=0, le=10**9)]
 
 
 class _RogueLine(BaseModel):
-    """A line of `rogue.jsonl`, the log of injected datagrams. The line describes one datagram, or only counts several
-    datagrams.
+    """A line of `rogue.jsonl`, the log of injected datagrams. The line describes one datagram, or contains only the
+    number of several datagrams.
     """
 
     model_config = ConfigDict(extra="ignore", defer_build=True)

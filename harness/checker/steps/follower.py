@@ -40,8 +40,8 @@ PAUSES = "receive_response_block_for_hash"
 """Name of the handler that pauses and continues the phase 3 timer. No record shows this pause."""
 
 TOUCH_A_TIMER = frozenset((PAUSES,))
-"""Message handlers that change a timer. The comparison must save the timers before it runs one of these handlers. To
-undo any other message handler, it needs only the recorded changes.
+"""Message handlers that change a timer. The comparison must save the timers before it runs one of these handlers. It
+can undo any other message handler with the recorded changes alone.
 """
 
 Delayed = Callable[[float, float], bool]
@@ -134,8 +134,8 @@ class StepComparer:
         """The last pause of the phase 3 timer: the number of the trace line, and the time on the agent's clock."""
         self._top, self._top_hex = b"", ""
         self._state: StateSummary | None = None
-        """The agent's state at the last comparison, if the reference has not changed since then. It makes another
-        comparison unnecessary.
+        """The agent's state at the last comparison, if the reference has not changed since then. A line with the same
+        state then needs no further comparison.
         """
 
     def follow(self, line: int, run: HandlerRun) -> None:

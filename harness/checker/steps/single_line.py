@@ -189,8 +189,8 @@ def _as_it_may_have_been(
 
 
 def _was_received(before: StepComparer, expected: HandlerRun, run: HandlerRun, others: OtherRecords) -> bool:
-    """Return true if another agent received a message on this line that the reference does not send. The line is then
-    no damaged copy of the expected line.
+    """Return true if the line contains a sent message that differs from the expected ones, and another agent received
+    this message. The agent then really sent the message, so the line is not damaged.
     """
     sent_by_both = [sent.datagram for sent in expected.sent]
     return any(

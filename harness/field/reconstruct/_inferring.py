@@ -135,8 +135,8 @@ def _incarnation_records(capture: AgentCapture, events: Sequence[LoggableEvent])
 
 
 def _last_seen(received: Sequence[CapturedDatagram], last_s: float, restart_s: float) -> float:
-    """Return a time until which the agent was certainly running. After its last message before the restart, this is the
-    time of the first query that it did not answer.
+    """Return the assumed end of an incarnation, which sent its last message at `last_s`. This is the time of the first
+    query after `last_s`, because the agent did not answer it. Without such a query, return `restart_s`.
     """
     later = (sighting for sighting in received if last_s < sighting.at_s)
     questions = (sighting.at_s for sighting in later if isinstance(decode(sighting.datagram).message, ANSWERED_QUERIES))

@@ -105,8 +105,8 @@ class RecordedTrace:
 
     @cached_property
     def unrecorded(self) -> dict[int, str]:
-        """Position of an entry whose deviation lost lines may explain -> a description of the lost lines, such as
-        "lines are missing ...".
+        """Position of an entry -> a description of the lost lines directly before it, such as "lines are missing ...".
+        These lost lines may explain a deviation of the entry.
         """
         lost = {} if self.is_counted else lost_lines(self.trace)
         of_runs = [position for position, entry in enumerate(self.entries) if isinstance(entry.content, HandlerRun)]

@@ -26,7 +26,7 @@ from ucp.messages import Message
 from ucp.trace import HandlerRun
 
 CHECKPOINT_STEPS = 1000
-"""Number of steps between two checkpoints. To go back, the player replays half of this number on average, which takes
+"""Number of steps between two checkpoints. To go back, the player replays half of these steps on average, which takes
 some milliseconds.
 """
 
@@ -109,8 +109,8 @@ class RecordPlayer:
         self._clock_set = ClockChangeDetector(record)
         self._resumption = ResumptionSearch(record, self._blocks)
         self.resumed_at: int | None = None
-        """The position after the entry at which the state became known again after the last gap. None if there was no
-        such entry.
+        """The state of the agent is unknown after a gap. This is the position from which on the state is known again
+        after the last gap. None if the replay has not passed such a position.
         """
         self._follower, self._incarnation = self._new_follower(), 1
         self._checkpoints = {0: _PlayerCheckpoint(self._follower.copy(), 1, self.result.copy())}

@@ -49,8 +49,8 @@ MAX_UNSENT_BYTES = 1 << 20
 and no further files of vehicles.
 """
 MAX_WAITING_BYTES = 1 << 16
-"""Number of bytes waiting to be sent to a slow vehicle. Above this number, further data for this vehicle are
-dropped.
+"""Limit for the data that wait to be sent to a slow vehicle, in bytes. Above this limit, further data for this vehicle
+are dropped.
 """
 DRAIN_S = 0.02
 OUTPUT = "output.log"

@@ -587,8 +587,8 @@ def _rounded(seconds: float | None) -> float | None:
 
 
 def _disconnected_until(at_s: float, network: Sequence[NetworkState]) -> list[NetworkState]:
-    """Return a corrected copy of these records of network changes. Scripted deliveries end at `at_s`. Up to this time,
-    the copy states that the network is not fully connected.
+    """Return a copy of these records of network changes. The copy states that the network is not fully connected up to
+    `at_s`, because scripted deliveries can lose messages until this time.
     """
     since = round(at_s + 0.001, 3)  # include messages of the same instant
     before = [state.model_copy(update={"fully_connected": False}) for state in network if state.at_s < since]

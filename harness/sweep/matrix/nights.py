@@ -131,8 +131,8 @@ def _load(path: Path) -> MatrixRecord:
 
 
 LAST = 60
-"""Maximum number of files of nights that are read. If there are more files, the newest ones are read. The names of the
-files begin with the date, so the newest files are the last ones in alphabetical order.
+"""Maximum number of nights that are read, with one file for each night. If there are more files, only the newest ones
+are read. The names of the files begin with the date, so the newest files are the last ones in alphabetical order.
 """
 
 

@@ -31,7 +31,7 @@ from harness.sweep.explore.guided._mutation import MutationLimits, mutate
 
 BITS = 1 << 28
 """Size of the bit field of a `DigestSet` in bits. It takes 32 MiB of memory. After ten million numbers, about one in 30
-new numbers seems to be a member.
+new numbers is wrongly taken for a member.
 """
 
 
