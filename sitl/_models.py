@@ -43,7 +43,7 @@ class MotionModel(Protocol):
         """Land at `place`, and stop at this place. `before` is the previous place, as in `go_to`."""
 
     def ascent(self, start: MotionState, altitude_m: float) -> Sequence[MotionSegment]:
-        """Take off without a mission. Then stay, or circle if the vehicle is a plane, without end."""
+        """Take off without a mission. Afterwards, a plane circles forever, and any other vehicle stays at its place."""
 
 
 MODELS: dict[VehicleType, MotionModel] = {"copter": CopterMotion(), "plane": PlaneMotion(), "rover": RoverMotion()}

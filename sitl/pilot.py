@@ -226,7 +226,7 @@ class _ListenOnlyProcedure:
 
 
 class _StepWaitingTimes:
-    """The time for which the pilot has waited for each step, in simulated seconds and in seconds of wall time."""
+    """A record of how long the pilot has waited for each step, in simulated seconds and in seconds of wall time."""
 
     def __init__(self, link: PilotLink) -> None:
         self._link = link

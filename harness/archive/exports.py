@@ -307,8 +307,7 @@ def agents_directory(directory: Path) -> Path:
 
 
 def export_files(paths: Iterable[Path]) -> list[Path]:
-    """Return the export files at `paths`: the paths that are files, and the exports in run directories and directories
-    of exports.
+    """Return the export files at `paths`. A path is an export file, a run directory, or a directory of exports.
 
     A run directory or a directory of traces may contain no exports. Raises RunDirectoryError if a path does not exist,
     or is a directory with other files.

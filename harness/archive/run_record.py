@@ -233,7 +233,7 @@ class CapturedFrames(_RecordModel):
 
 
 class ChannelLateness(_RecordModel):
-    """The lateness with which the process of a shared channel delivered messages, in mission seconds."""
+    """How late the process of a shared channel delivered messages, in mission seconds."""
 
     deliveries: int
     median_s: float
@@ -372,7 +372,7 @@ class RemoteRecord(_RecordModel):
     host: str
     """Address from which the agent joined last."""
     worker: str | None = None
-    """Address of the Dask worker that played the agent. null if a user let the agent join."""
+    """Address of the Dask worker that ran the agent. null if a user let the agent join."""
     command: list[str] = []
     """Command of the agent on that computer."""
     joins: int = 0
@@ -386,9 +386,9 @@ class RemoteRecord(_RecordModel):
     drift: float | None = None
     """Relative error of the rate of that computer's clock."""
     delay_s: float | None = None
-    """Delay of the connection in one direction: the median half of a round trip."""
+    """Delay of the connection in one direction: half of the median round trip."""
     delay_p95_s: float | None = None
-    """Delay that one in twenty delays of the connection exceeded."""
+    """The 95 % quantile of the delay: one delay in twenty was longer."""
     delay_most_s: float | None = None
     """Longest delay in all incarnations."""
     pings: int = 0

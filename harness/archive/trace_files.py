@@ -17,7 +17,7 @@ MAX_TRACE_BYTES = 256 * 1024 * 1024
 minutes.
 """
 PACKED_FROM_BYTES = 64 * 1024 * 1024
-"""Size of all traces of a run together, in bytes, from which they are compressed."""
+"""The harness compresses the traces of a run if their total size is at least this number of bytes."""
 PACKED_SHARE = 1 / 6
 """Size of a packed trace, as a share of its content."""
 

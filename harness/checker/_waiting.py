@@ -57,7 +57,7 @@ class _UnfinishedOperation:
     since: float = math.inf
     """Mission second of the last step. Infinity before the first vote or reconcile."""
     due_s: float = math.inf
-    """Mission second until which the next step must follow. Infinity if no vote or reconcile is in progress."""
+    """Latest mission second at which the next step must happen. Infinity if no vote or reconcile is in progress."""
     was_late: bool = False
     """True if the next step was overdue, but the agent's computer may have been suspended. In this case, the check
     extends the time limit once.

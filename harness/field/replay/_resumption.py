@@ -27,7 +27,7 @@ from ucp.trace import HandlerRun
 from ucp.trigger import EventTrigger, LocalTrigger
 
 _ChainSteps = dict[bytes, tuple[bytes, str]]
-"""Chain hash -> the chain hash below it, and the hash of the block between them."""
+"""Chain hash -> the chain hash before its last block, and the block hash of this block."""
 
 
 class ResumptionSearch:

@@ -33,7 +33,7 @@ WORKER = 0
 (`harness.play.hosts`). In this case, the session is the address of the worker.
 """
 JOIN_LIMIT_S = 300.0
-"""Seconds of wall time in which all far ends must connect."""
+"""Time limit for the connection of all far ends, in seconds of wall time."""
 PINGS = 20
 PING_LIMIT_S = 10.0
 MAX_HANDSHAKES = 16

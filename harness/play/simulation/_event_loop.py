@@ -392,7 +392,7 @@ class EventLoop:
         """Return the next mission second at which a timer of the agent expires, or at which the agent must send a
         delayed answer.
 
-        `soonest` is the time on the agent's clock at which this would happen if no timer were late.
+        Without late timers, this is the time `soonest` on the agent's clock.
         """
         if number not in self._late:
             return incarnation.mission_s(soonest)

@@ -50,7 +50,9 @@ SIZE_SETTINGS = frozenset(("max_block_bytes", "max_event_bytes"))
 
 @dataclass(frozen=True, order=True)
 class FindingIdentity:
-    """The properties by which two findings are recognised as the same one, in any run."""
+    """The properties that identify a finding. If two runs give findings with equal properties, both are the same
+    finding.
+    """
 
     key: str
     """The key of the check with a bad verdict."""

@@ -30,7 +30,7 @@ class RunRow:
     verdicts: list[str]
     figures: list[str]
     failed: str | None
-    """The error because of which the run has no verdicts, or None."""
+    """The reason why the run has no verdicts, if it is an error. None otherwise."""
     unsupported: str | None
     """The feature that an agent lacks, so the run has no verdicts, or None."""
 
