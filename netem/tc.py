@@ -58,7 +58,7 @@ def may_refuse(conditions: NetworkConditions) -> bool:
 
 
 @dataclass
-class _RemovedClassTotals:
+class _RemovedTrafficTotals:
     """The counters of packets in traffic classes that were removed."""
 
     passed: int = 0
@@ -85,7 +85,7 @@ class NetemEngine(Engine):
         super().__init__(fabric)
         self._netlink: NetlinkSocket = fabric.netlink
         self._ports = {vehicle: TrafficControl(fabric.port_index(vehicle)) for vehicle in self._vehicles}
-        self._removed = {vehicle: _RemovedClassTotals() for vehicle in self._vehicles}
+        self._removed = {vehicle: _RemovedTrafficTotals() for vehicle in self._vehicles}
         self._kinds: _Numbers = {}
         self._groups: _Numbers = {}
         self._loss_conditions: NetworkConditions | None = None  # the conditions of the present classes; None if unknown
