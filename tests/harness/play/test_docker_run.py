@@ -44,7 +44,7 @@ def long_run(tmp_path: Path, **keys: Any) -> Running:
 def test_scenarios_hold_in_containers(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     asked = ("--vehicles", "embedded", "--speedup", 40, "--seed", 1, "--out", out)
-    done = harness("run", SCENARIOS / f"{name}.yaml", *ON_DOCKER, *asked, deadline_s=180)
+    done = harness("run", SCENARIOS / f"{name}.yaml", *ON_DOCKER, *asked)
     assert done.returncode == 0, done.stdout + done.stderr
     record = json.loads((out / "run.json").read_text())
     assert [one["verdict"] for one in record["characteristics"].values()] == ["holds"] * 6

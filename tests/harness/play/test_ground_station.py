@@ -88,7 +88,7 @@ def test_operator_flies_a_real_copter_under_a_debugger(backend: tuple[str, ...],
     scenario = write_scenario(tmp_path, agents=2, vehicles=vehicles, duration_s=60, speedup=1)
     out = tmp_path / "run"
     gcs = ("--gcs", f"127.0.0.1:{ground.port}")
-    done = harness("run", scenario, "--out", out, *gcs, "--backend", *backend, deadline_s=300)
+    done = harness("run", scenario, "--out", out, *gcs, "--backend", *backend)
     ground.over.set()
     ground.join()
     assert done.returncode == 0, done.stdout + done.stderr

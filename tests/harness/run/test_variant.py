@@ -147,7 +147,7 @@ def test_agent_process_runs_with_the_variant(pop_variant: Path) -> None:
 def test_conformance_expects_the_variant(pop_variant: Path, tmp_path: Path) -> None:
     agent = (sys.executable, "-m", "harness.play.variant_agent", pop_variant)
     asked = ("conformance", "--virtual", "--only", 11, "--variant", pop_variant, "--keep", tmp_path / "kept")
-    done = harness(*asked, "--", *agent, deadline_s=300)
+    done = harness(*asked, "--", *agent)
     assert done.returncode == 0, done.stdout
 
 

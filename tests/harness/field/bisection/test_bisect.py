@@ -70,7 +70,7 @@ def records(tmp_path_factory: pytest.TempPathFactory, scenario: Path) -> Path:
 
 def test_bisect_finds_the_commit_that_broke_a_scenario(repository: Path, scenario: Path) -> None:
     before = set(Path(tempfile.gettempdir()).glob("ucp-harness-*"))
-    ended = harness("bisect", scenario, "--good", "HEAD~5", "--repository", repository, "--json", deadline_s=120)
+    ended = harness("bisect", scenario, "--good", "HEAD~5", "--repository", repository, "--json")
     assert ended.returncode == 0, ended.stderr
     document = json.loads(ended.stdout)
     assert [(commit["subject"], "ucp/reconcile.py" in commit["files"]) for commit in document["first"]] == [
@@ -84,7 +84,7 @@ def test_bisect_finds_the_commit_that_broke_a_scenario(repository: Path, scenari
 
 
 def test_bisect_finds_the_commit_that_broke_a_record(repository: Path, records: Path) -> None:
-    ended = harness("bisect", records, "--good", "HEAD~5", "--repository", repository, "--json", deadline_s=120)
+    ended = harness("bisect", records, "--good", "HEAD~5", "--repository", repository, "--json")
     assert ended.returncode == 0, ended.stderr
     document = json.loads(ended.stdout)
     assert [commit["subject"] for commit in document["first"]] == ["broken"]

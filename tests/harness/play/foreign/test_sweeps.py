@@ -47,7 +47,7 @@ def test_explore_finds_and_shrinks_a_crash(tmp_path: Path) -> None:
     command = {2: small(tmp_path, EXPORT + THIRD_EVENT_KILLS)}
     events = {"source": "scripted", "script": [{"at_s": at_s, "agent": 1 + at_s % 2} for at_s in range(1, 10)]}
     path = write_scenario(tmp_path, agent_command=command, duration_s=20, events=events)
-    done = harness("explore", path, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml", deadline_s=240)
+    done = harness("explore", path, "--seeds", 1, "--jobs", 2, "--out", tmp_path / "shrunk.yaml")
     assert done.returncode == 1
     assert "agent 2: crashed: it ended by itself with status 1 after it received an event at " in done.stdout
     assert "its last output: the third event was too much" in done.stdout

@@ -95,7 +95,7 @@ def test_agents_on_two_workers_are_judged_as_on_one_machine(tmp_path: Path, host
         timeline=[{"at_s": 60, "reboot": [2], "down_s": 20, "disk": "kept"}, {"at_s": 120, "kill": [5]}],
     )
     away, here = tmp_path / "away", tmp_path / "here"
-    done = harness("run", path, "--seed", 1, "--scheduler", hosts.scheduler_address, "--out", away, deadline_s=240)
+    done = harness("run", path, "--seed", 1, "--scheduler", hosts.scheduler_address, "--out", away)
     assert done.returncode in (0, 4), done.stderr
     record = record_of(away)
     placed: dict[str, list[int]] = {}
@@ -108,7 +108,7 @@ def test_agents_on_two_workers_are_judged_as_on_one_machine(tmp_path: Path, host
         words = f"{agents[0]} and {agents[1]}" if len(agents) == 2 else f"{agents[0]}\u2013{agents[-1]}"
         assert f"Agents {words} ran on the worker {worker}" in (away / "report.md").read_text()
     until(lambda: hosts.left_behind() == [])
-    assert harness("run", path, "--seed", 1, "--out", here, deadline_s=240).returncode in (0, 4)
+    assert harness("run", path, "--seed", 1, "--out", here).returncode in (0, 4)
     counted = [losses(record), losses(record_of(here))]
     for lost, sent in counted:
         assert sent > 300
@@ -166,7 +166,7 @@ def test_secured_mission_gives_good_verdicts_on_a_worker(tmp_path: Path, hosts: 
     hosts.start("one")
     out = tmp_path / "run"
     path = scenario(tmp_path, security={"keys": "fresh"}, final_reconcile=True)
-    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", out, deadline_s=240)
+    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", out)
     assert (verdicts(record_of(out)), done.returncode) == (GOOD, 0), done.stderr
     until(lambda: hosts.left_behind() == [])
 
@@ -269,7 +269,7 @@ def test_vehicle_that_exits_on_a_worker_ends_the_run_with_its_output(tmp_path: P
     binary.write_text("#!/bin/sh\necho bind failed >&2\nexit 1\n")
     binary.chmod(0o755)
     path = flights(tmp_path, {"kind": "ardupilot", "binary": str(binary)})
-    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", tmp_path / "run", deadline_s=240)
+    done = harness("run", path, "--scheduler", hosts.scheduler_address, "--out", tmp_path / "run")
     said = sentences(done.stderr)[0]
     assert re.search(r"vehicle \d \(ardupilot\) ended by itself with status 1; its last output .*: bind failed", said)
     assert done.returncode == 2
