@@ -298,7 +298,7 @@ def main() -> NoReturn:
         _end(*error.details, str(error), exit_status=error.exit_status)
     except OSError as error:
         if error.errno in (errno.EACCES, errno.ENAMETOOLONG) and error.filename is not None:
-            _end(f"{str(error.filename)[:MAX_NAME]}: cannot be looked at: {error.strerror}", exit_status=WRONG_REQUEST)
+            _end(f"{str(error.filename)[:MAX_NAME]}: cannot be accessed: {error.strerror}", exit_status=WRONG_REQUEST)
         if error.filename is not None:
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard the buffered output

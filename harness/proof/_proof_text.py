@@ -91,7 +91,7 @@ def _mark(proof: Proof, kind: str) -> str:
 def _of_the_whole(proof: Proof) -> Iterator[str]:
     live = proof.liveness
     if proof.bounds.network == "any":
-        yield "- not looked at, one chain, livelock: they need the states of all agents together: use --network lossy"
+        yield "- not checked, one chain, livelock: they need the states of all agents together: use --network lossy"
         return
     if live is None:
         if proof.whole_ended != "complete":

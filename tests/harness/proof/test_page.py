@@ -73,7 +73,7 @@ def one_chain(proof: Proof) -> str:
     """
     live = proof.liveness
     if live is None:
-        return "not looked at"
+        return "not checked"
     *cannot, last = [f"{states:,}" for states in live.astray]
     if live.lost is not None:
         return f"never, from {last} ({'; '.join(dict.fromkeys([*cannot, last]))})"
@@ -96,7 +96,7 @@ def test_row_of_the_page_equals_the_proof(row: Row, tmp_path: Path) -> None:
     assert proof.complete
     assert proof.flaw is None, "everything holds in every state"
     assert row.get("in every state", "holds") == "holds"
-    livelocks = "not looked at" if proof.liveness is None else str(len(proof.liveness.cycles))
+    livelocks = "not checked" if proof.liveness is None else str(len(proof.liveness.cycles))
     found = f"{proof.figures.states:,}", f"{proof.figures.transitions:,}", one_chain(proof), livelocks
     assert found == (row["states"], row["transitions"], row["one chain"], row["livelocks"])
 

@@ -272,7 +272,7 @@ def test_time_limit_ends_a_long_question_about_one_state(monkeypatch: pytest.Mon
 def test_network_any_checks_each_agent_against_all_messages(tmp_path: Path) -> None:
     proof = prove(Bounds(2, 2, "any", ("reboot",)), out=tmp_path / "none.yaml")
     assert proof.exit_status == 0
-    assert any("not looked at" in line for line in in_words(proof))
+    assert any("not checked" in line for line in in_words(proof))
     wrong = prove(Bounds(2, 2, "any", quirks={"commit_others_twice": True}, reduced=False), out=tmp_path / "wrong.yaml")
     assert wrong.flaw is not None
     assert wrong.flaw.kind == "3"
