@@ -193,9 +193,9 @@ def _try_once(
                 console.print(Text(f"{command or code}: {outcome.sentence}"), soft_wrap=True)
                 outcomes.append(outcome)
     except UntestableError as error:
-        complain(
-            f"{code} cannot be tried: {error}; name the repository with --repository (the installed code is in {ROOT})"
-        )
+        is_no_repository = None in request.commands and not (code / "ucp").is_dir()
+        hint = f"; name the repository with --repository (the installed code is in {ROOT})" if is_no_repository else ""
+        complain(f"{code} cannot be tried: {error}{hint}")
         raise typer.Exit(UNTESTABLE) from None
     except InterruptedRunError:
         raise

@@ -1,6 +1,9 @@
 """Send the recorded inputs of one agent to a different agent program over UDP, and compare its messages with the
 recorded ones.
 
+If the machine runs programs late, a correct agent can differ from its record. The harness therefore measures the delays
+of the machine. If the machine was late and messages differ, the harness repeats the replay at a lower speed.
+
 The agent runs in a lab with one other node, which simulates all its peers. This node sends the datagrams that the peers
 sent according to the record, at the same times.
 
@@ -20,10 +23,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
+from harness.archive.run_journals import LAG_FILE, LagLine
 from harness.archive.vocabulary import first_unknown, unknown_names
 from harness.checker.recorded_inputs import decoded
 from harness.checker.steps.core_in_use import settings_in_use
@@ -33,6 +37,7 @@ from harness.field.replay import RecordedTrace
 from harness.play.agent_control import AgentRefusedError, AgentSilentError
 from harness.play.process.agent_mission import mission_file
 from harness.play.process.controlled_program import STOP_GRACE_S, ControlledProgram, ProgramEndedError
+from harness.play.process.lag_meter import LagMeter
 from harness.scenario import Scenario
 from netem.errors import LabUnavailable, NetemError
 from netem.lab import Lab
@@ -62,6 +67,10 @@ SLACK_S, SLACK_WALL_S = 1.0, 0.15
 """Maximum difference between the time of a message and its recorded time. The first value is in mission seconds, the
 second in seconds of wall time. The sum of both applies.
 """
+MAX_PLAYS = 3
+"""Maximum number of replays. Each replay has half the speed of the previous one."""
+MAX_MACHINE_DELAY_S = 0.05
+"""If the machine never wakes a program later than this number of seconds of wall time, it explains no difference."""
 HASH_DIGITS = 12
 
 
@@ -71,6 +80,31 @@ class NotStartedError(HarnessError):
 
 class ReplayFailedError(HarnessError):
     """An error: the agent program ended unexpectedly, or refused a command."""
+
+
+class BusyMachineError(HarnessError):
+    """An error: this machine runs programs too late to attribute the differences to the agent program."""
+
+
+@dataclass(frozen=True)
+class ReceivedMessages:
+    """The messages of the agent program, each with its mission second. `machine_delay_s` is the greatest delay of the
+    machine during the replay, in seconds of wall time.
+    """
+
+    messages: list[tuple[float, Message]]
+    machine_delay_s: float
+
+
+@dataclass(frozen=True)
+class MessageDifference:
+    """A difference between the messages of the agent program and the record, at mission second `t`. `subject` is equal
+    for the same difference in several replays.
+    """
+
+    t: float
+    subject: tuple[Any, ...]
+    reported: RecordDifference
 
 
 @dataclass(frozen=True)
@@ -218,20 +252,38 @@ def play_live(
     record: RecordedTrace, command: Sequence[str], directory: Path, *, speedup: float
 ) -> list[RecordDifference]:
     """Send the recorded inputs to an agent program. Return the differences between the messages of the program and the
-    recorded messages. Raises MachineError, NotStartedError, ReplayFailedError. Raises FieldError if the record has
-    unknown names.
+    recorded messages. Raises MachineError, NotStartedError, ReplayFailedError. Raises BusyMachineError if the
+    messages differ because the machine runs programs late. Raises FieldError if the record has unknown names.
     """
     if unknown := first_unknown(unknown_names(record.trace.runs), ("trigger", "handler", "branch", "timer")):
         raise FieldError(f"{record.path}: {unknown}, so it cannot be played; give another record")
     script = script_of(record)
+    common: set[tuple[Any, ...]] | None = None
+    for number in range(MAX_PLAYS):
+        place = directory / f"replay-{number + 1}"
+        place.mkdir()
+        slower = speedup / 2**number
+        received = _play_in_lab(_AgentProgramReplay(record, script, command, place, slower))
+        found = sorted(_compare(script, received.messages, SLACK_S + SLACK_WALL_S * slower), key=attrgetter("t"))
+        if not found or received.machine_delay_s <= MAX_MACHINE_DELAY_S:
+            return [each.reported for each in found]
+        subjects = {each.subject for each in found}
+        common = subjects if common is None else common & subjects
+    if not common:
+        raise BusyMachineError(
+            f"this machine woke programs up to {received.machine_delay_s:.2g} s late, so the differences may be no "
+            "error of the agent; give a lower --speedup, or try again when the machine is less busy"
+        )
+    return [each.reported for each in found if each.subject in common]
+
+
+def _play_in_lab(replay: "_AgentProgramReplay") -> ReceivedMessages:
     try:
-        received = asyncio.run(_AgentProgramReplay(record, script, command, directory, speedup).play())
+        return asyncio.run(replay.play())
     except LabUnavailable as error:
         raise MachineError(str(error)) from None
     except NetemError as error:
         raise MachineError(f"the lab failed: {error}") from None
-    found = sorted(_compare(script, received, SLACK_S + SLACK_WALL_S * speedup), key=itemgetter(0))
-    return [difference for _, difference in found]
 
 
 class _AgentProgramReplay:
@@ -245,7 +297,7 @@ class _AgentProgramReplay:
         self._speedup = speedup
         self._peers_id = next(number for number in range(MAX_AGENT_ID, 0, -1) if number not in record.header.roster)
 
-    async def play(self) -> list[tuple[float, Message]]:
+    async def play(self) -> ReceivedMessages:
         agent_id = self._record.agent_id
         lab = await Lab.open((agent_id, self._peers_id), log=self._place / "lab.log")
         async with lab:
@@ -281,7 +333,7 @@ class _AgentProgramReplay:
         )
         return {**mission, "events": {**mission["events"], "source": "none"}}
 
-    async def _run_mission(self, lab: Lab, agent: ControlledProgram) -> list[tuple[float, Message]]:
+    async def _run_mission(self, lab: Lab, agent: ControlledProgram) -> ReceivedMessages:
         epoch_us = round((time.time() + START_DELAY_S) * MICROSECONDS)
         script, received = self._place / "script.jsonl", self._place / "heard.jsonl"
         lines = [given.to_json() for given in self._script.datagrams]
@@ -305,16 +357,18 @@ class _AgentProgramReplay:
             stderr=self._place / "peers.log",
         )
         await _ask(agent, "start", epoch_us=epoch_us)
+        meter = await LagMeter.start(self._place / LAG_FILE, epoch_us, self._speedup, lab.networks)
         commanding = asyncio.create_task(self._command_reconciles(agent, epoch_us))
         ending = asyncio.create_task(agent.process.wait())
         over_s = self._script.ends_s + SLACK_S + SLACK_WALL_S * self._speedup
         done, _ = await asyncio.wait({ending}, timeout=self._wall_s(epoch_us, over_s))
         commanding.cancel()
+        await meter.stop()
         await peers.terminate(STOP_GRACE_S)
         if done:
             raise ReplayFailedError(_end_text(agent, agent.ended()))
         ending.cancel()
-        return _received(received, self._record.agent_id)
+        return ReceivedMessages(_received(received, self._record.agent_id), _machine_delay_s(self._place / LAG_FILE))
 
     async def _command_reconciles(self, agent: ControlledProgram, epoch_us: int) -> None:
         for t in self._script.reconciles:
@@ -359,10 +413,14 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
     return received
 
 
-def _compare(
-    script: PeerScript, received: list[tuple[float, Message]], slack_s: float
-) -> Iterator[tuple[float, RecordDifference]]:
-    """Yield each message that is missing, different or unexpected, with its mission second. Near the end of a
+def _machine_delay_s(path: Path) -> float:
+    """Return the greatest delay in a file that the lag meter wrote, in seconds of wall time."""
+    lines = path.read_text(encoding="ascii").splitlines()
+    return max(LagLine.model_validate_json(line).machine_s for line in lines)
+
+
+def _compare(script: PeerScript, received: list[tuple[float, Message]], slack_s: float) -> Iterator[MessageDifference]:
+    """Yield each message that is missing, different or unexpected. Near the end of a
     reconcile, missing and unexpected messages are not reported, because an agent does not answer during a reconcile.
     """
     unmatched = list(received)
@@ -381,14 +439,16 @@ def _compare(
             continue
         did = f"it sent {_message_text(same_subject[1])}" if same_subject is not None else "it did not send it"
         detail = f"{did}; the record sent {_message_text(expected_message.message)}, at {expected_message.t:g} s"
-        yield (
+        yield MessageDifference(
             expected_message.t,
+            (expected_message.line, None if same_subject is None else same_subject[1]),
             RecordDifference(line=expected_message.line, handler=expected_message.handler, detail=detail),
         )
     for t, message in unmatched:
         if not script.is_near_reconcile_end(t, slack_s):
             detail = f"it sent {_message_text(message)} at {t:.1f} s; the record has no such message"
-            yield t, RecordDifference(line=script.line_at(t), handler=None, detail=detail)
+            reported = RecordDifference(line=script.line_at(t), handler=None, detail=detail)
+            yield MessageDifference(t, (None, message), reported)
 
 
 def _subject(message: Message) -> tuple[type, Any]:

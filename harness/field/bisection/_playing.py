@@ -17,7 +17,7 @@ from harness.errors import (
     HarnessError,
     InterruptedRunError,
 )
-from harness.field.bisection._live_replay import NotStartedError, ReplayFailedError, play_live
+from harness.field.bisection._live_replay import BusyMachineError, NotStartedError, ReplayFailedError, play_live
 from harness.field.bisection.outcome import AgentResult, BisectionSubject, Outcome, RecordDifference, outcome_of_run
 from harness.field.replay import open_record
 from harness.run.code_state import ROOT, ProcessResult, run_python
@@ -183,7 +183,7 @@ class SubjectPlayer:
         arguments = _split_command(command, code)
         try:
             message = play_live(record, arguments, directory, speedup=self._speedup or SPEEDUP)
-        except NotStartedError as error:
+        except (NotStartedError, BusyMachineError) as error:
             raise UntestableError(str(error)) from None
         except ReplayFailedError as error:
             return Outcome(subject=self.subject.in_words, crashed=str(error))

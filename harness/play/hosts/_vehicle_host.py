@@ -31,7 +31,7 @@ from typing import Any
 
 from harness.play.hosts._nursery import Nursery
 from harness.play.hosts._vehicle_files import FILE_HEADER, file_names, file_path
-from harness.play.process._lag_meter import LagMeter
+from harness.play.process.lag_meter import LagMeter
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._forked_process import ForkedProcess

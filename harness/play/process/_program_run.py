@@ -28,10 +28,10 @@ from harness.play.mission import RunOutcome, SoughtRun
 from harness.play.process._agent_process import AgentProcess
 from harness.play.process._channel_process import ChannelProcess
 from harness.play.process._fleet import Fleet
-from harness.play.process._lag_meter import LagMeter
 from harness.play.process._rogue_process import RogueProcess
 from harness.play.process._run_lab import MissionLab, OpenLab, VehicleLab
 from harness.play.process._watchers import MissionTasks, open_unless_interrupted
+from harness.play.process.lag_meter import LagMeter
 from harness.play.process.process_preflight import add_rogue_listener
 from harness.play.progress import ProgressDisplay, SwarmSnapshot
 from harness.play.remote._remote_agents import RemoteAgents

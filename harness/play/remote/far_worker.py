@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from harness.play.process._lag_meter import LagMeter
+from harness.play.process.lag_meter import LagMeter
 from harness.play.remote._connection import Connection
 from harness.play.remote._far_clock import pong
 from harness.play.remote._forked_process import ForkedProcess

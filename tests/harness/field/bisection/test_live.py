@@ -4,12 +4,20 @@ import json
 import shlex
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from harness.errors import FieldError
-from harness.field.bisection._live_replay import play_live, script_of
+from harness.field.bisection import _live_replay
+from harness.field.bisection._live_replay import (
+    MAX_MACHINE_DELAY_S,
+    BusyMachineError,
+    ReceivedMessages,
+    play_live,
+    script_of,
+)
 from harness.field.bisection._scripted_peers import AgentLateness, message_key
 from harness.field.replay import open_record
 from tests.harness.command import harness
@@ -69,6 +77,63 @@ def test_record_with_unknown_names_is_rejected(records: Path, tmp_path: Path) ->
     (tmp_path / "2.trace.jsonl").write_text((records / "2.trace.jsonl").read_text().replace("vote_timer_", "poll_"))
     with pytest.raises(FieldError, match=r"unknown handler name 'poll_expiration', so it cannot be played; give"):
         play_live(open_record(tmp_path, 2), ["no-such-agent"], tmp_path, speedup=1.0)
+
+
+@pytest.fixture
+def plays(records: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[float]]:
+    """A function that sets the results of the next replays. Each result contains the indexes of the messages that the
+    agent did not send, and the delay of the machine. Return the speeds of the replays.
+    """
+    expected = script_of(open_record(records, 2)).expected
+
+    def set_results(*results: tuple[set[int], float]) -> list[float]:
+        speeds: list[float] = []
+
+        def play(replay: _live_replay._AgentProgramReplay) -> ReceivedMessages:
+            missing, delay_s = results[len(speeds)]
+            speeds.append(replay._speedup)
+            sent = [(each.t, each.message) for index, each in enumerate(expected) if index not in missing]
+            return ReceivedMessages(sent, delay_s)
+
+        monkeypatch.setattr(_live_replay, "_play_in_lab", play)
+        return speeds
+
+    return set_results
+
+
+LATE_S = 2 * MAX_MACHINE_DELAY_S
+
+
+def test_difference_is_reported_if_the_machine_is_on_time(
+    records: Path, tmp_path: Path, plays: Callable[..., list[float]]
+) -> None:
+    speeds = plays(({0}, MAX_MACHINE_DELAY_S))
+    (difference,) = play_live(open_record(records, 2), ["agent"], tmp_path, speedup=8)
+    assert difference.detail.startswith("it did not send it") and speeds == [8]
+
+
+@pytest.mark.parametrize("second", [(set[int](), LATE_S), (set[int](), 0.0)])
+def test_replay_on_a_late_machine_is_repeated_more_slowly(
+    records: Path, tmp_path: Path, plays: Callable[..., list[float]], second: tuple[set[int], float]
+) -> None:
+    speeds = plays(({0}, LATE_S), second)
+    assert play_live(open_record(records, 2), ["agent"], tmp_path, speedup=8) == [] and speeds == [8, 4]
+
+
+def test_difference_in_all_replays_on_a_late_machine_is_reported(
+    records: Path, tmp_path: Path, plays: Callable[..., list[float]]
+) -> None:
+    speeds = plays(({0, 1}, LATE_S), ({0, 2}, LATE_S), ({0}, LATE_S))
+    (difference,) = play_live(open_record(records, 2), ["agent"], tmp_path, speedup=8)
+    assert difference.line == script_of(open_record(records, 2)).expected[0].line and speeds == [8, 4, 2]
+
+
+def test_agent_is_not_accused_if_each_replay_on_a_late_machine_differs(
+    records: Path, tmp_path: Path, plays: Callable[..., list[float]]
+) -> None:
+    plays(({0}, LATE_S), ({1}, LATE_S), ({2}, LATE_S))
+    with pytest.raises(BusyMachineError, match=r"woke programs up to 0\.1 s late, .* give a lower --speedup"):
+        play_live(open_record(records, 2), ["agent"], tmp_path, speedup=8)
 
 
 def test_peers_are_delayed_while_a_late_agent_reconciles() -> None:
