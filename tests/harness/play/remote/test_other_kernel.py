@@ -92,4 +92,4 @@ def test_agent_on_another_kernel_is_judged_as_any_agent(computers: TwoComputers)
     assert (verdicts(record), record["status"]) == (GOOD, 0), output
     remote = record["remote"]["2"]
     assert (remote["host"], remote["joins"], remote["lost"]) == ("192.168.8.2", 2, 0)
-    assert remote["drift"] is not None
+    assert remote["pings"] > 0
