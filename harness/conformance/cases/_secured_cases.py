@@ -3,8 +3,9 @@
 import asyncio
 import os
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,21 @@ if TYPE_CHECKING:
 BUNDLE = "keys.json"
 ASKING_PEER, LOST_PEER = PEERS[:2]
 SECTION = "contract, Secured missions"
+CRYPTOGRAPHY = "cryptography"
+
+
+def secured_case(name: str, algorithm: int = 0) -> Callable[[Callable[[CaseBench], Awaitable[None]]], None]:
+    """Return a decorator that adds a test case with keys. Without the extra `secure`, the case is not applicable."""
+
+    def declare(play: Callable[[CaseBench], Awaitable[None]]) -> None:
+        async def play_with_keys(bench: CaseBench) -> None:
+            if find_spec(CRYPTOGRAPHY) is None:
+                raise CannotJudgeError(f"{CRYPTOGRAPHY} is not installed here: run `pip install 'ucp-harness[secure]'`")
+            await play(bench)
+
+        case(name, SECTION, algorithm)(play_with_keys)
+
+    return declare
 
 
 class SecuredPeers:
@@ -119,10 +135,8 @@ class SecuredPeers:
 
 @asynccontextmanager
 async def _secured(bench: CaseBench) -> AsyncIterator[tuple[SecuredPeers, "KeySet"]]:
-    try:
-        from ucp.secure.bundle import KeySet, write_bundle
-    except ModuleNotFoundError as error:
-        raise CannotJudgeError(f"{error.name} is not installed here: run `pip install 'ucp-harness[secure]'`") from None
+    from ucp.secure.bundle import KeySet, write_bundle
+
     if bench.lab.remote is not None and not bench.lab.remote.is_encrypted:
         raise CannotJudgeError(
             "the connection to the agent is not encrypted: run `pip install 'ucp-harness[secure]'` on its computer"
@@ -137,7 +151,7 @@ async def _secured(bench: CaseBench) -> AsyncIterator[tuple[SecuredPeers, "KeySe
         yield SecuredPeers(agent, keys), keys
 
 
-@case("with keys, only authentic and new datagrams have an effect", SECTION)
+@secured_case("with keys, only authentic and new datagrams have an effect")
 async def _authentic(bench: CaseBench) -> None:
     from ucp.secure.bundle import KeySet
     from ucp.secure.envelope import CLEAR
@@ -169,7 +183,7 @@ async def _authentic(bench: CaseBench) -> None:
             await peers.require_single_answer(f"a datagram {what}")
 
 
-@case("with keys, a recorded echo does not restore an earlier boot", SECTION)
+@secured_case("with keys, a recorded echo does not restore an earlier boot")
 async def _recorded_echo(bench: CaseBench) -> None:
     from ucp.secure.envelope import CHALLENGE, read_clear_header
     from ucp.secure.secured_agent import make_boot
@@ -195,7 +209,7 @@ async def _recorded_echo(bench: CaseBench) -> None:
         await peers.require_single_answer("the same echo again")
 
 
-@case("with keys, blocks are signed in messages and in the export", SECTION, 1)
+@secured_case("with keys, blocks are signed in messages and in the export", 1)
 async def _signed(bench: CaseBench) -> None:
     from ucp.secure.block_signature import block_claim
     from ucp.secure.crypto_suite import verify
@@ -215,7 +229,7 @@ async def _signed(bench: CaseBench) -> None:
         )
 
 
-@case("with keys, a revocation is passed on, and revoked senders are dropped", SECTION)
+@secured_case("with keys, a revocation is passed on, and revoked senders are dropped")
 async def _revoked(bench: CaseBench) -> None:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
