@@ -305,6 +305,9 @@ def _error(error: Exception) -> dict[str, Any]:
 
 
 def main() -> None:
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM):
+        # Shells and nohup let background commands ignore these signals. Agents must not inherit this.
+        signal.signal(number, signal.SIG_DFL)
     control = socket.socket(fileno=int(sys.argv[1]))
     control.set_inheritable(False)
     LabServer(control).run()

@@ -55,6 +55,20 @@ def test_file_of_a_program_ends_at_its_limit(tmp_path: Path) -> None:
     assert "File too large" in (tmp_path / "err").read_text()
 
 
+def test_programs_do_not_ignore_the_signals_that_the_harness_ignores(tmp_path: Path) -> None:
+    async def story(lab: Lab) -> None:
+        ignored = await output(lab, tmp_path, 1, "/bin/sh", "-c", "grep SigIgn /proc/self/status")
+        assert not int(ignored.split()[1], 16) & sum(1 << number - 1 for number in ending)
+
+    ending = (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGTERM)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in ending}
+    try:
+        in_lab(tmp_path, story, (1,))
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def test_vehicle_has_its_address_a_broadcast_address_and_a_default_route(tmp_path: Path) -> None:
     async def story(lab: Lab) -> None:
         said = await output(lab, tmp_path, 258, "/bin/sh", "-c", "ip -4 -o addr; ip route; ip link show lo")
