@@ -34,6 +34,7 @@ from ucp.trace import CommandEntry, DroppedDatagram, Entry, HandlerRun, header_l
 
 if TYPE_CHECKING:
     from ucp.secure.secured_agent import SecuredAgent
+    from ucp.telemetry import TelemetryEvents
 
 MAX_READ_BYTES = 65536
 DATAGRAMS_PER_TURN = 64
@@ -76,6 +77,7 @@ class Node:
         self._loop = Loop() if loop is None else loop
         self._loop.on_error = self._log_exception
         self._timer: ScheduledCall | None = None
+        self._telemetry = self._prepared_telemetry()
         self._close_source: Callable[[], object] = lambda: None
         self._control = ControlServer(
             directory / f"{mission.agent_id}.control",
@@ -263,8 +265,8 @@ class Node:
         self.generating = True
         if self.mission.events.source == "random":
             self._schedule_random_event(RandomEvents(Random(self.mission.seed), self.mission.events.mean_s))
-        elif self.mission.events.source == "mavlink":
-            self._connect_vehicle()
+        elif self._telemetry is not None:
+            self._connect_vehicle(self._telemetry)
         self._log_line(f"mission started, events from {self.mission.events.source}")
 
     def _schedule_random_event(self, source: RandomEvents) -> None:
@@ -277,14 +279,26 @@ class Node:
         expected = self._loop.call_later(self.clock.wall_s(self._joined_s + due - self.clock.now()), log)
         self._close_source = expected.cancel
 
-    def _connect_vehicle(self) -> None:
-        from ucp.telemetry import TelemetryEvents, VehicleConnection  # only missions with a vehicle load it
+    def _prepared_telemetry(self) -> "TelemetryEvents | None":
+        """Return the converter for the telemetry of the vehicle. Return None if the events do not come from a vehicle.
+
+        The agent creates the converter before the mission starts, because the import of MAVLink needs half a second of
+        processor time.
+        """
+        source = self.mission.events
+        if source.source != "mavlink":
+            return None
+        from ucp.telemetry import TelemetryEvents
+
+        return TelemetryEvents(source.position_interval_s, Random(self.mission.seed), source.log)
+
+    def _connect_vehicle(self, telemetry: "TelemetryEvents") -> None:
+        from ucp.telemetry import VehicleConnection  # only missions with a vehicle load it
 
         source = self.mission.events
-        events = TelemetryEvents(source.position_interval_s, Random(self.mission.seed), source.log)
 
         def sink(data: bytes) -> None:
-            for event_id, event_data in events.receive(data, self.clock.now()):
+            for event_id, event_data in telemetry.receive(data, self.clock.now()):
                 self.log_event(event_id, event_data)
 
         self._close_source = VehicleConnection(self._loop, source.vehicle_host, source.vehicle_port, sink).close

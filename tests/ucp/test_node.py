@@ -165,6 +165,20 @@ def test_agent_imports_modules_for_the_features_of_its_mission(
     assert module in modules_of(directory, mission(**asked))
 
 
+def test_agent_imports_mavlink_before_the_mission_starts(directory: Path) -> None:
+    """The import needs half a second of processor time, in which the agent would not answer."""
+    path = directory / "7.mission.json"
+    path.write_text(json.dumps(mission(events={"source": "mavlink"})))
+    process = subprocess.Popen([sys.executable, "-v", "-m", "ucp.node", str(path)], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + DEADLINE_S
+    while not (directory / "7.log").exists() or "ready" not in (directory / "7.log").read_text():
+        assert time.monotonic() < deadline, "it was never ready"
+        time.sleep(0.005)
+    process.terminate()
+    _, errors = process.communicate(timeout=DEADLINE_S)
+    assert "import 'pymavlink.dialects.v20.common'" in errors
+
+
 def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
     """Play a short mission, and return the modules that the agent has imported at its end."""
     path = directory / "7.mission.json"
