@@ -23,6 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import partial
+from math import inf
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
@@ -414,14 +415,16 @@ def _received(path: Path, agent_id: int) -> list[tuple[float, Message]]:
 
 
 def _machine_delay_s(path: Path) -> float:
-    """Return the greatest delay in a file that the lag meter wrote, in seconds of wall time."""
+    """Return the greatest delay in a file that the lag meter wrote, in seconds of wall time. An empty file measures
+    nothing, so the delay can have any value.
+    """
     lines = path.read_text(encoding="ascii").splitlines()
-    return max(LagLine.model_validate_json(line).machine_s for line in lines)
+    return max((LagLine.model_validate_json(line).machine_s for line in lines), default=inf)
 
 
 def _compare(script: PeerScript, received: list[tuple[float, Message]], slack_s: float) -> Iterator[MessageDifference]:
-    """Yield each message that is missing, different or unexpected. Near the end of a
-    reconcile, missing and unexpected messages are not reported, because an agent does not answer during a reconcile.
+    """Yield each message that is missing, different or unexpected. Near the end of a reconcile, missing and unexpected
+    messages are not reported, because an agent does not answer during a reconcile.
     """
     unmatched = list(received)
     for expected_message in script.expected:

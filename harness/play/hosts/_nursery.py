@@ -16,6 +16,7 @@ import socket
 import sys
 from collections.abc import Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,11 @@ MAX_ORDER_BYTES = 1 << 16
 OWN_AGENT = [sys.executable, "-P", "-m", "ucp.node"]
 """The command of the harness's own agent. The nursery runs this agent in a forked process. It starts every other agent
 as a separate program.
+"""
+
+MAVLINK = "pymavlink.dialects.v20.common"
+"""A module that the agents of vehicles need. Its import needs half a second of processor time, so the nursery imports
+it once for all agents.
 """
 
 
@@ -79,6 +85,8 @@ def _serve(requests: socket.socket, user_namespace: bool) -> None:
         if not data:
             return
         order = json.loads(data)
+        if order["agent"] is None:
+            import_module(MAVLINK)
         if order["vehicle"] not in networks:
             networks[order["vehicle"]] = far_network.create_network()
         network = networks[order["vehicle"]]

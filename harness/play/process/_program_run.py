@@ -8,6 +8,7 @@ ends the mission early. The agents that are still alive then export their chains
 import asyncio
 import base64
 import contextlib
+import os
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
@@ -52,6 +53,10 @@ POLL_S = 0.25
 QUIET_POLL_S = 0.1
 PACK_S = 1.0
 """Seconds of wall time between two searches for finished parts of traces, which the harness then compresses."""
+STARTS_PER_CORE = 8
+"""Maximum number of agents per processor core that start at the same time. If all agents of a large swarm started at
+once, each agent would need too long until its first answer.
+"""
 START_DELAY_S = 0.05
 MIN_FOLLOW_S = 0.1
 """Minimum seconds of wall time between two reads of the vehicles' positions."""
@@ -223,7 +228,13 @@ class ProgramRun:
 
     async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
-        await asyncio.gather(*(self._start_agent(agent, lab) for agent in self.agents))
+        starting = asyncio.Semaphore(STARTS_PER_CORE * (os.cpu_count() or 1))
+
+        async def start(agent: AgentProcess) -> None:
+            async with contextlib.nullcontext() if agent.agent_id in self._remote else starting:
+                await self._start_agent(agent, lab)
+
+        await asyncio.gather(*map(start, self.agents))
         if self._rogue is not None:
             await self._rogue.start(lab.network)
             self._watchers.start(self._rogue.watch(), of="rogue")
