@@ -1,4 +1,5 @@
-"""Create private networks for processes, with unshare(1) for the first process and setns(2) inside it.
+"""Create private networks for processes. The command unshare(1) starts the first process. This process then uses
+setns(2) to enter the networks.
 
 The first process is PID 1 of its own PID namespace. Its end therefore ends each process of the lab, and afterwards the
 kernel removes namespaces, links and rules. Three mechanisms end the first process after the harness has ended. The

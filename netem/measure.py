@@ -104,7 +104,9 @@ class AnswerRow:
 
     @property
     def ok(self) -> bool:
-        """True if the confidence interval contains the requested value, within the resolution of engines."""
+        """True if the confidence interval contains the requested value. A difference below the resolution of the
+        engines is tolerated.
+        """
         asked = self.question.asked
         margin = RESOLUTION * max(1.0, asked)
         return self.answer.low - margin <= asked <= self.answer.high + margin

@@ -234,9 +234,9 @@ class _TurnToPlace(NamedTuple):
 
 
 def _turn_towards(start: MotionState, place: LocalPlace, radius_m: float, rather_left_m: float) -> _TurnToPlace | None:
-    """Return the left or right turn, whichever gives the shorter path to the place. The function adds `rather_left_m`
-    to the length of the path with the right turn. A plane that is turning right continues to the right unless the other
-    path is much shorter. Return None if the place is inside the circles of both turns.
+    """Return the turn, left or right, that gives the shorter path to the place. Return None if the place is inside the
+    circles of both turns. Two rules change the lengths before the comparison. A right turn counts as longer by
+    `rather_left_m`. If the plane is turning right now, a left turn counts as longer by `STILL_RIGHT_M`.
     """
     ways = []
     for side in (1, -1):  # to the right, to the left

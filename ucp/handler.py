@@ -46,7 +46,7 @@ class EventHandler(Generic[P]):
 
     @property
     def title(self) -> str:
-        """Return the number and name of the Algorithm, as the first words of the handler's docstring."""
+        """Return the number and name of the Algorithm. The first words of the handler's docstring contain both."""
         algorithm = re.match(rf"Algorithm ({self.algorithm}), (\w[\w ]+\w)", self.run.__doc__ or "")
         assert algorithm, f"the docstring of {self.name} begins with its algorithm"
         return " ".join(algorithm.groups())

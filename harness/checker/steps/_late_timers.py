@@ -74,8 +74,8 @@ class JudgedTimers:
 def _in_virtual_time(
     evidence: Evidence, agent_id: int, expiries: Sequence[RecordedTimerExpiry]
 ) -> Iterator[StepDeviation]:
-    """Yield each expiry that came later than the delays in the scenario explain. A simulated machine causes no other
-    delays.
+    """Yield each expiry that came too late. In virtual time, only delays of the scenario, such as pauses, may make an
+    expiry late.
     """
     for expiry in expiries:
         due_s = expiry.t - max(0.0, expiry.late_s)

@@ -178,7 +178,9 @@ def estimate(
 
 
 def _height(hull: list[Point], rate: float, of: Callable[[Iterator[float]], float]) -> float:
-    """Return the value at t = 0 of the line with slope `rate` that touches the convex hull."""
+    """Return the value at t = 0 of a line with slope `rate` through one of the points. If `of` is `min`, this is the
+    lowest such line. If `of` is `max`, this is the highest such line.
+    """
     return of(u - rate * t for t, u in hull)
 
 

@@ -134,7 +134,9 @@ class ControlledProgram:
             raise
 
     async def watch(self) -> None:
-        """Wait until the program ends without a request of the harness. Then raise ProgramEndedError."""
+        """Wait until the program ends. Then raise ProgramEndedError. If the harness ends the program, it first cancels
+        this call.
+        """
         await self.process.wait()
         raise self.ended()
 

@@ -11,8 +11,8 @@ KILL_LIMIT_S = 3.0
 
 
 class RemoteProgram:
-    """A stand-in as a `LabProgram`. A process cannot catch SIGSTOP and SIGKILL, so this object sends other signals to
-    the stand-in.
+    """Control a stand-in as if it were the remote agent. A process cannot catch SIGSTOP and SIGKILL. In place of these
+    signals, the stand-in receives signals that it can catch.
     """
 
     def __init__(self, stand_in: LabProgram, left_behind: Callable[[], Sequence[str]]) -> None:

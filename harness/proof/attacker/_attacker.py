@@ -68,8 +68,8 @@ class Attacker:
         self._forgeries: dict[tuple[int, ForgeryMaterial], tuple[int, ...]] = {}
 
     def forged_messages(self, locals_: tuple[int, ...]) -> Iterator[tuple[AgentAction, ...]]:
-        """Yield each action of the attacker. In an action, the attacker sends one message to one set of agents. Actions
-        in which the message has no effect on one of these agents are omitted.
+        """Yield each action of the attacker. In an action, the attacker sends one message to one set of agents. An
+        action is omitted if the message has no effect on at least one agent of the set.
         """
         messages = dict.fromkeys(
             message for place, material in self.material(locals_) for message in self._to(locals_[place], material)

@@ -274,7 +274,7 @@ class InstantOutcomes:
         return outcomes
 
     def _when_counting(self, local: int, heard: ReceivedMessages, lossy: bool) -> list[_Outcome] | None:
-        """Return the possible steps of an agent that ignores or only counts each of these messages. The order of the
+        """Return the possible results if the agent only counts or ignores each of these messages. The order of the
         messages then has no effect. Return None if the agent does anything else with one of the messages.
 
         Whether the agent counts an answer depends on only two things: the state without the vote counts, and whether

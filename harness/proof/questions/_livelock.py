@@ -138,9 +138,9 @@ def show(graph: StateGraph, cycles: Sequence[list[int]], path: Path, name: str) 
 
 
 def _nearest(graph: StateGraph, alike: Sequence[list[int]]) -> list[_CycleExample]:
-    """Return some cycles of one form, with the best example first. A cycle that is possible with real clocks is better
-    than one that is not. Otherwise, a cycle with fewer coincidences is better, and then a cycle with fewer blocks whose
-    completion time is fixed.
+    """Return some of the cycles `alike`, which all have the same form. The best example comes first. Cycles that are
+    possible with real clocks come before the others. Among these, cycles with fewer coincidences come first, and among
+    these, cycles with fewer blocks whose completion time is fixed.
     """
     tried: list[tuple[bool, int, int, _CycleExample]] = []
     for cycle in sorted(alike, key=lambda cycle: len(graph.path(cycle[0])))[:MAX_PLAYED]:

@@ -1,5 +1,5 @@
-"""The module that pytest loads first. It loads the plugin, unless Python would import other packages with the names of
-the harness's packages.
+"""The module that pytest loads first. It loads the plugin, unless Python would import foreign packages in place of the
+harness's packages.
 
 A project may have a folder with the name of one of the harness's packages, and a process can import only one of the
 two. In this case the plugin is not loaded, and the project's tests run as if it were not installed. A test that uses a

@@ -274,8 +274,8 @@ def check_fits(document: Any, base: Document, limits: MutationLimits) -> Documen
 
 
 def _is_part(value: Any, whole: Any) -> bool:
-    """Return true if `value` equals `whole`, or is a mapping that contains only entries of `whole`. For example, a
-    scenario with fewer agents has fewer entries.
+    """Return true if `value` equals `whole`, or if `value` is a mapping and `whole` contains all of its entries.
+    Entries that are mappings are compared in the same way.
     """
     if isinstance(value, dict) and isinstance(whole, dict):
         return all(_is_part(part, whole.get(key)) for key, part in value.items())
