@@ -45,6 +45,7 @@ if _IS_PROGRAM:
     _interrupts_are_quiet(True)
     gc.disable()  # until the module of the command is imported
 
+import codecs
 import errno
 import io
 from importlib import import_module
@@ -267,6 +268,22 @@ def _harness(
     """Test harness for the Uniform Chain Protocol."""
 
 
+ASCII_MARKS = {"✔": "+", "✘": "x"}
+"""Mark of a verdict -> the mark in a terminal without Unicode. All other unknown characters become "?"."""
+_ENCODING_ERRORS = "ascii-marks"
+
+
+def _replace_unknown_characters(error: UnicodeError) -> tuple[str, int]:
+    """Replace the characters that the terminal cannot show, as `codecs.register_error` defines."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    unknown = error.object[error.start : error.end]
+    return "".join(ASCII_MARKS.get(character, "?") for character in unknown), error.end
+
+
+codecs.register_error(_ENCODING_ERRORS, _replace_unknown_characters)
+
+
 class _OutputWithoutBrokenPipe(io.FileIO):
     """Standard output that tolerates a reader that ends early (`| head`). The command then continues without output."""
 
@@ -286,7 +303,7 @@ def main() -> NoReturn:
         sys.stdout = io.TextIOWrapper(
             io.BufferedWriter(_OutputWithoutBrokenPipe(original.fileno(), "w", closefd=False)),
             original.encoding,
-            original.errors,
+            _ENCODING_ERRORS,
             line_buffering=original.line_buffering,
         )
     try:

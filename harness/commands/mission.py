@@ -195,7 +195,8 @@ def _texts(option: str, pairs: list[str] | None) -> dict[str, str]:
 
 
 def _pairs(option: str, pairs: list[str] | None) -> dict[str, object]:
-    """Parse the options, which have the form KEY=VALUE. Return key -> value. A value that is not valid JSON is a text.
+    """Parse the options, which have the form KEY=VALUE. Return key -> value. A value that is not valid JSON becomes a
+    text.
     """
     values: dict[str, Any] = {}
     for key, text in _texts(option, pairs).items():

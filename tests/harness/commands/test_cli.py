@@ -1,12 +1,14 @@
 """Test the command line without a virtual network: `check`, wrong requests, and exit statuses."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.harness.command import harness, sentences, write_scenario
+from tests.harness.command import COMMAND, harness, sentences, write_scenario
 from tests.harness.mission import CONNECTED, edit, fly, write_exports, write_run
 
 PERFECT = Path(__file__).parents[3] / "scenarios" / "perfect.yaml"
@@ -22,6 +24,15 @@ def test_check_of_a_run_directory_shows_six_verdicts(run_dir: Path) -> None:
     assert done.returncode == 0
     assert done.stdout.count("holds") == 6
     assert not done.stderr
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_terminal_without_unicode_shows_verdicts(run_dir: Path, encoding: str) -> None:
+    edit(run_dir / "agents" / "2.chain.json", lambda export: export["chain"][0].update(timestamp_us=5))
+    env = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([*COMMAND, "check", run_dir], env=env, capture_output=True, encoding=encoding, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    assert "x violated" in done.stdout and "+ holds" in done.stdout
 
 
 def test_check_gives_characteristics_and_figures_as_json(run_dir: Path) -> None:
