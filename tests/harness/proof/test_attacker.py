@@ -56,7 +56,7 @@ CAPTURED = 3
 @cache
 def explored(agents: int = 3, blocks: int = 1, lies: int = 1) -> StateGraph:
     swarm = ModelSwarm(Bounds(agents, blocks, "lossy", captured=agents, lies=lies))
-    graph = explore(swarm, most_bytes=8e9, most_s=60)
+    graph = explore(swarm, most_bytes=8e9, most_s=600)
     assert graph.ended == "complete"
     return graph
 
@@ -153,7 +153,7 @@ def test_random_message_has_the_effect_of_one_of_the_forgeries() -> None:
 def test_reduced_and_whole_state_spaces_are_equal() -> None:
     reduced, whole = (
         explored(2, 2),
-        explore(ModelSwarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=60),
+        explore(ModelSwarm(Bounds(2, 2, "lossy", captured=2, reduced=False)), most_bytes=8e9, most_s=600),
     )
     assert len(reduced.states) < len(whole.states)
     assert all_seen(reduced) == all_seen(whole)
@@ -232,7 +232,7 @@ def test_security_gate_without_a_rule_is_found(
     monkeypatch: pytest.MonkeyPatch, kind: str, owner: type, rule: str, broken: Any
 ) -> None:
     monkeypatch.setattr(owner, rule, broken)
-    graph = explore(ModelSwarm(Bounds(2, 1, "lossy", captured=2)), most_bytes=8e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(2, 1, "lossy", captured=2)), most_bytes=8e9, most_s=600)
     assert graph.flaw is not None
     assert graph.flaw.kind == kind
 
@@ -277,7 +277,7 @@ def test_attacker_without_messages_violates_nothing(tmp_path: Path) -> None:
 
 
 def test_unlimited_lies_in_any_network_violate_nothing_more(tmp_path: Path) -> None:
-    collected = collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=60)
+    collected = collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=600)
     assert (collected.ended, collected.flaw, collected.shown) == ("complete", None, {"1", "4"})
 
 
@@ -326,7 +326,7 @@ def test_random_attacks_in_any_network_are_contained() -> None:
             put_back(agent, known.snapshot)
             seen.add(seen_of([agent]))
 
-    assert collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=60, keep=keep).ended == "complete"
+    assert collect(Bounds(3, 1, "any", captured=CAPTURED), most_bytes=8e9, most_s=600, keep=keep).ended == "complete"
     for seed in range(150):
         for there in lied_to_at_any_time(Random(seed)):
             assert there in seen

@@ -147,6 +147,6 @@ def test_livelock_needs_its_number_of_coincidences(tmp_path: Path) -> None:
     assert least > 0
     for most, found in ((least - 1, False), (least, True)):
         swarm = ModelSwarm(Bounds(2, 4, "lossless", coincidences=most))
-        assert explore(swarm, most_bytes=8e9, most_s=60).ended == "complete"
+        assert explore(swarm, most_bytes=8e9, most_s=600).ended == "complete"
         proof = prove(swarm.bounds, out=tmp_path / f"{most}.yaml")
         assert bool(proof.livelocks) == found

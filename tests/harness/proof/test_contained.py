@@ -60,7 +60,7 @@ def test_larger_zone_contains_the_smaller_one() -> None:
 def test_cycle_whose_times_shift_is_no_livelock() -> None:
     """The times of the two agents shift in each round. The graph has a cycle, but no run repeats this cycle forever."""
     swarm = ModelSwarm(Bounds(2, 3, "lossy", stagger=STAGGER, clocks_any=True, zones_contained=True))
-    graph = explore(swarm, most_bytes=8e9, most_s=60)
+    graph = explore(swarm, most_bytes=8e9, most_s=600)
     assert [*_cyclic_parts(graph, lambda: None)]
     assert [*cycles(graph)] == []
 

@@ -26,7 +26,7 @@ Seen = tuple[View, ...]
 
 
 def explored(*arguments: Any, **options: Any) -> StateGraph:
-    graph = explore(ModelSwarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(*arguments, **options)), most_bytes=8e9, most_s=600)
     assert graph.ended == "complete"
     return graph
 
@@ -88,7 +88,7 @@ def test_reduced_and_whole_state_spaces_are_equal(
 @pytest.mark.parametrize("network", ["lossless", "lossy"])
 def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
     in_one, in_every = ModelSwarm(Bounds(3, 2, network)), ModelSwarm(Bounds(3, 2, network), every_count=True)
-    one, every = (explore(swarm, most_bytes=8e9, most_s=60) for swarm in (in_one, in_every))
+    one, every = (explore(swarm, most_bytes=8e9, most_s=600) for swarm in (in_one, in_every))
     assert in_one.local.steps < in_every.local.steps
     assert len(one.states) <= len(every.states)
     assert all_seen(one) == all_seen(every)
@@ -106,10 +106,10 @@ def test_reduction_of_tallies_changes_no_result(network: Any) -> None:
 def test_two_cores_give_the_result_of_one(bounds: Bounds, most_told: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     monkeypatch.setattr("harness.proof.graph._workers.MAX_REPORTED", most_told)
-    alone = explore(ModelSwarm(bounds), most_bytes=8e9, most_s=60)
+    alone = explore(ModelSwarm(bounds), most_bytes=8e9, most_s=600)
     swarm = ModelSwarm(bounds)
     with Workers(swarm, 2) as workers:
-        shared = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)
+        shared = explore(swarm, most_bytes=8e9, most_s=600, workers=workers)
         assert _convergence.look(shared, workers=workers) == _convergence.look(alone)
     assert shared.workers_steps > 0
     assert shared.ended == alone.ended == "complete"

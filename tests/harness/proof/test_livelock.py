@@ -120,7 +120,7 @@ def test_state_that_needs_two_votes_becomes_a_scenario(tmp_path: Path) -> None:
 
 
 def test_single_path_gives_the_result_of_all_successors(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = explore(ModelSwarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(4, 2, "lossy")), most_bytes=8e9, most_s=600)
     forks = [state for state in graph.states if graph.swarm.is_idle(state) and len(graph.swarm.chains(state)) > 1]
     lazy = ExtraVotes(graph.swarm)
     needed = [lazy.needed(fork) for fork in forks]

@@ -153,7 +153,7 @@ CELLS = [*ways_round()]
 
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.bounds.in_words())
 def test_number_of_cycles_equals_that_of_the_page(cell: Cell) -> None:
-    graph = explore(ModelSwarm(cell.bounds), most_bytes=4e9, most_s=60)
+    graph = explore(ModelSwarm(cell.bounds), most_bytes=4e9, most_s=600)
     assert graph.ended == "complete"
     assert f"{len(look(graph).cycles)} ({len(graph.states):,})" == cell.said
 

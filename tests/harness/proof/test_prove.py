@@ -102,7 +102,7 @@ def test_timer_that_was_not_stopped_is_found_before_it_expires(tmp_path: Path) -
 
 def test_wrong_step_on_a_late_message_is_found() -> None:
     bounds = Bounds(2, 2, "any", quirks={"pause_without_resume": True}, reduced=False, steps=True)
-    collected = collect(bounds, most_bytes=8e9, most_s=60)
+    collected = collect(bounds, most_bytes=8e9, most_s=600)
     assert collected.flaw is not None
     assert collected.flaw.handler == "receive_response_block_for_hash"
     assert collected.way[-1] == "it hears a Block Response from agent 1"
@@ -204,7 +204,7 @@ def test_interrupted_workers_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("harness.proof.graph._workers.WORTH_WORKERS", 10)
     swarm = ModelSwarm(Bounds(3, 3, "lossy"))
     with Workers(swarm, 2) as workers:
-        graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers, watch=interrupt)
+        graph = explore(swarm, most_bytes=8e9, most_s=600, workers=workers, watch=interrupt)
     assert graph.ended == "interrupted"
     assert graph.looked_at == LOOK_EVERY
     assert not multiprocessing.active_children()
@@ -221,7 +221,7 @@ def test_ctrl_c_during_the_start_of_workers_is_not_lost(monkeypatch: pytest.Monk
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job of a shell ignores SIGINT
     try:
         with Workers(swarm, 2) as workers:
-            graph = explore(swarm, most_bytes=8e9, most_s=60, workers=workers)
+            graph = explore(swarm, most_bytes=8e9, most_s=600, workers=workers)
     finally:
         signal.signal(signal.SIGINT, before)
     assert not interruptions
@@ -232,8 +232,8 @@ def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkey
     monkeypatch.setattr(
         import_module("harness.proof._proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
-    explored = explore(ModelSwarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=60)
-    proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
+    explored = explore(ModelSwarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=600)
+    proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=600), tmp_path / "none.yaml")
     assert (proof.ended, proof.whole_ended, proof.exit_status) == ("complete", "time", INCOMPLETE)
     assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
 

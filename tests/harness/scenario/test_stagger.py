@@ -76,7 +76,7 @@ def test_staggered_phase_1_alone_allows_a_livelock_in_resonance() -> None:
 
 @pytest.mark.parametrize("stagger", [{"vote_timeout_s": 0.5}, {"phase1_timeout_s": 0.5}, STAGGER])
 def test_stagger_leaves_no_livelock_within_bounds(stagger: Stagger) -> None:
-    graph = explore(ModelSwarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=60)
+    graph = explore(ModelSwarm(Bounds(2, 3, "lossy", stagger=stagger)), most_bytes=4e9, most_s=600)
     assert graph.ended == "complete"
     assert not look(graph).cycles
 
