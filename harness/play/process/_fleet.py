@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from functools import partial
 from typing import Any
 
@@ -67,14 +68,22 @@ class Fleet:
         lost_worker = partial(self._lost_worker, vehicle_id)
         return VehicleProcess(vehicle_id, sysid, kind, self._rundir, incarnation, lost_worker)
 
-    async def start(self, lab: VehicleLab, show: Callable[[str], None]) -> None:
-        """Start all vehicles, and wait until all vehicles can be armed. `show` receives the progress as text. Raises
-        VehicleFailedError, and ScenarioError if the ground station cannot be reached.
+    async def start(
+        self, lab: VehicleLab, limit: AbstractAsyncContextManager[object], show: Callable[[str], None]
+    ) -> None:
+        """Start all vehicles, and wait until all vehicles can be armed. Each vehicle starts inside the context `limit`.
+        `show` receives the progress as text. Raises VehicleFailedError, and ScenarioError if the ground station cannot
+        be reached.
         """
         if not self._vehicles:
             return
         show("starting vehicles")
-        await asyncio.gather(*(self._boot(vehicle, lab) for vehicle in self._vehicles.values()))
+
+        async def boot(vehicle: VehicleProcess) -> None:
+            async with limit:
+                await self._boot(vehicle, lab)
+
+        await asyncio.gather(*map(boot, self._vehicles.values()))
         if self._scenario.gcs:
             self._station = await self._open_station(ListenAddress.parse(self._scenario.gcs))
         for vehicle in self._vehicles.values():

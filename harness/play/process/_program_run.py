@@ -54,8 +54,8 @@ QUIET_POLL_S = 0.1
 PACK_S = 1.0
 """Seconds of wall time between two searches for finished parts of traces, which the harness then compresses."""
 STARTS_PER_CORE = 8
-"""Maximum number of agents per processor core that start at the same time. If all agents of a large swarm started at
-once, each agent would need too long until its first answer.
+"""Maximum number of programs per processor core that start at the same time. If all programs of a large swarm started
+at once, each program would need too long until its first answer.
 """
 START_DELAY_S = 0.05
 MIN_FOLLOW_S = 0.1
@@ -108,6 +108,7 @@ class ProgramRun:
         self.network = describe(NetworkConditions())
         self.clock = MissionClock(scenario.speedup)
         self._hosts = hosts
+        self._start_limit = asyncio.Semaphore(STARTS_PER_CORE * (os.cpu_count() or 1))
         self._remote = RemoteAgents(scenario, rundir, self.clock.now, hosts)
         self.agents = [
             AgentProcess(agent_id, rundir, agent_commands[agent_id], self.clock.now)
@@ -193,7 +194,8 @@ class ProgramRun:
 
     async def begin(self, first: Change) -> None:
         self._watchers.start(self._remote.watch_hosts(), of="hosts")
-        await self._fleet.start(self._vehicle_lab, self._show)
+        limit = self._start_limit if self._hosts is None else contextlib.nullcontext()
+        await self._fleet.start(self._vehicle_lab, limit, self._show)
         await self._start_agents(self._lab)
         if self._channel is not None:
             await self._channel.start(self._lab.network)
@@ -228,10 +230,9 @@ class ProgramRun:
 
     async def _start_agents(self, lab: MissionLab) -> None:
         self._show("starting agents")
-        starting = asyncio.Semaphore(STARTS_PER_CORE * (os.cpu_count() or 1))
 
         async def start(agent: AgentProcess) -> None:
-            async with contextlib.nullcontext() if agent.agent_id in self._remote else starting:
+            async with contextlib.nullcontext() if agent.agent_id in self._remote else self._start_limit:
                 await self._start_agent(agent, lab)
 
         await asyncio.gather(*map(start, self.agents))
