@@ -170,13 +170,18 @@ def test_agent_imports_mavlink_before_the_mission_starts(directory: Path) -> Non
     path = directory / "7.mission.json"
     path.write_text(json.dumps(mission(events={"source": "mavlink"})))
     process = subprocess.Popen([sys.executable, "-v", "-m", "ucp.node", str(path)], stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + DEADLINE_S
-    while not (directory / "7.log").exists() or "ready" not in (directory / "7.log").read_text():
-        assert time.monotonic() < deadline, "it was never ready"
-        time.sleep(0.005)
+    wait_for_text(directory / "7.log", "ready")
     process.terminate()
     _, errors = process.communicate(timeout=DEADLINE_S)
     assert "import 'pymavlink.dialects.v20.common'" in errors
+
+
+def wait_for_text(path: Path, text: str) -> None:
+    """Wait until the file exists and contains the text."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not path.exists() or text not in path.read_text():
+        assert time.monotonic() < deadline, f"{path} never contained {text!r}"
+        time.sleep(0.005)
 
 
 def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
@@ -185,10 +190,7 @@ def modules_of(directory: Path, document: dict[str, Any]) -> set[str]:
     path.write_text(json.dumps(document | {"epoch_us": round(time.time() * 1e6)}))
     command = [sys.executable, "-X", "importtime", "-m", "ucp.node", str(path)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + DEADLINE_S
-    while not (directory / "7.trace.jsonl").exists() or not (directory / "7.trace.jsonl").stat().st_size:
-        assert time.monotonic() < deadline, "it never began"
-        time.sleep(0.005)
+    wait_for_text(directory / "7.trace.jsonl", "\n")
     process.terminate()
     _, errors = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 0, errors

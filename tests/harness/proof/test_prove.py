@@ -233,7 +233,7 @@ def test_limits_also_concern_questions_to_the_whole_graph(tmp_path: Path, monkey
         import_module("harness.proof._proof"), "explore", lambda *_, **__: replace(explored, seconds=61.0)
     )
     explored = explore(ModelSwarm(Bounds(2, 2, "lossy")), most_bytes=8e9, most_s=600)
-    proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=600), tmp_path / "none.yaml")
+    proof = prove(Bounds(2, 2, "lossy"), Limits(most_bytes=8e9, most_s=60), tmp_path / "none.yaml")
     assert (proof.ended, proof.whole_ended, proof.exit_status) == ("complete", "time", INCOMPLETE)
     assert [line[0] for line in in_words(proof) if "one chain" in line or "livelock" in line] == ["-", "-"]
 
